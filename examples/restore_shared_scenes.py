@@ -38,7 +38,7 @@ FIELD_OF_VIEW_DEG = 75.0
 
 @dataclass(frozen=True)
 class Scene:
-    """Return a picture in linear light; its 97th percentile is 1."""
+    """A picture in linear light; its 97th percentile is 1."""
 
     name: str
     radiance: Float[np.ndarray, "rows columns 3"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from udccal.compilation import FOLDER_VARIABLE, compilation_clock, compilation_folder
+from udccal.rig_folders import user_rig_folder
 
 # Compiles something large and something small: both are worth keeping.
 _PROGRAM = """
@@ -69,3 +70,14 @@ def test_processors_have_folders_of_their_own(tmp_path: Path, monkeypatch: pytes
 
 def test_there_is_one_clock() -> None:
     assert compilation_clock() is compilation_clock()
+
+
+def test_a_user_without_a_home_folder_names_another(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", no_home)
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    monkeypatch.setenv("UDCCAL_RIGS", str(tmp_path / "rigs"))
+    assert compilation_folder().parent == tmp_path
+    assert user_rig_folder() == tmp_path / "rigs"

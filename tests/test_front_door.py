@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import udccal
+from tests.toy_rigs import write_toy_rig
 
 # Of the processor, so that a busy machine fails nobody.
 _TRIES, _MOST_S = 5, 0.2
@@ -46,3 +48,19 @@ def test_an_unknown_name_is_answered_with_those_there_are() -> None:
 def test_a_term_that_is_none_is_refused() -> None:
     with pytest.raises(udccal.UdccalError, match="one of noise, geometry, wire, psf, backscatter, found 'wires'"):
         udccal.fit(object.__new__(udccal.Session), "wires")
+
+
+def test_a_result_of_a_term_that_is_none_is_refused() -> None:
+    profile = udccal.load_profile("lg55-reduced")
+    assert profile.result("wire") is profile.wire
+    with pytest.raises(udccal.UdccalError, match="one of noise, geometry, wire, psf, backscatter, found 'wires'"):
+        profile.result("wires")
+
+
+def test_a_capture_takes_names_of_terms_alone_and_leaves_no_session_for_others(tmp_path: Path) -> None:
+    with udccal.simulate(udccal.load_rig(write_toy_rig(tmp_path))) as bench:
+        for terms in (["noise", "wires"], "wires"):
+            with pytest.raises(udccal.UdccalError, match=r"of noise, .*, backscatter, found 'wires'"):
+                udccal.capture(tmp_path / "session", bench, terms)
+        assert not (tmp_path / "session").exists()
+        assert udccal.capture(tmp_path / "session", bench, "noise").steps("noise")

@@ -55,6 +55,37 @@ def test_what_is_no_description_is_left_to_the_schema(found: object) -> None:
         RigDescription.model_validate(present_rig(found))
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong", "says"),
+    [
+        (
+            "focal_mm = { value = 6.0, tolerance = 0.1 }",
+            "focal_mm = 6.0",
+            "'lens.focal_mm' .* found 6.0 without a tolerance, where { value = 6.0, tolerance = ... } belongs",
+        ),
+        ("focus_mm = 2000.0", "", "'lens.focus_mm' .* found none. Correct"),
+        ("focus_mm = 2000.0", "focus_mm = 2000.0\nfocus_m = 2.0", "'lens.focus_m' .* found a name that a rig does not"),
+        ("bits = 12", "bits = 99", "'camera.bits' .* found 99: it should be less than or equal to 16"),
+        ("pitch_um = 6.9", "pitch_um = '6,9'", "'camera.pitch_um' .* found '6,9': it should be a valid number"),
+        ("bits = 12", "bits = '" + 200 * "9" + "'", "found '9+[.]{3}9+': "),
+        ("value = 6.0, tolerance = 0.1", "value = 1e-9, tolerance = 0.1", "found a value of 1e-09, which must be from"),
+        ('name = "lg55-reduced"', 'name = "LG"', "'name' .* found 'LG': it should match pattern"),
+    ],
+)
+def test_a_mistake_is_told_with_what_was_found(tmp_path: Path, right: str, wrong: str, says: str) -> None:
+    text = (find_rig("lg55-reduced") / "rig.toml").read_text(encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(text.replace(right, wrong), encoding="utf-8")
+    with pytest.raises(RigError, match=says):
+        load_rig(tmp_path)
+
+
+def test_a_number_where_a_section_belongs_is_refused(tmp_path: Path) -> None:
+    text = (find_rig("lg55-reduced") / "rig.toml").read_text(encoding="utf-8")
+    (tmp_path / "rig.toml").write_text("lens = 3\n" + text.replace("[lens]", "[other]"), encoding="utf-8")
+    with pytest.raises(RigError, match=r"'lens' .* found 3, where a section belongs"):
+        load_rig(tmp_path)
+
+
 def test_toml_of_the_shipped_rigs_is_of_the_present_version() -> None:
     for name in ("lg55-aca2040", "lg55-reduced", "mk31-imx1600"):
         assert tomllib.loads((find_rig(name) / "rig.toml").read_text())["version"] == 2

@@ -130,7 +130,7 @@ def fit(session: Session, term: str, effort: FitEffort | None = None) -> FitResu
     Args:
         session: the captured session.
         term: noise, geometry, wire, psf or backscatter.
-        effort: effort of the fits.
+        effort: how much time the fits may take; None for full effort, ``udccal.effort.QUICK`` for a quick look.
 
     Returns:
         the term with its covariance; a term without steps is the same as from ``calibrate``.
@@ -152,7 +152,7 @@ def fit_foundation(
     Args:
         session: the captured session.
         progress: called with a term's name when its fit begins.
-        effort: effort of the fits.
+        effort: how much time the fits may take; None for full effort, ``udccal.effort.QUICK`` for a quick look.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
@@ -173,7 +173,7 @@ def calibrate(
     Args:
         session: the captured session.
         progress: called with a term's name when its fit begins.
-        effort: effort of the fits.
+        effort: how much time the fits may take; None for full effort, ``udccal.effort.QUICK`` for a quick look.
         foundation: result of ``fit_foundation`` for the same session, when it has already run.
 
     Raises:

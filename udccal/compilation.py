@@ -27,8 +27,9 @@ def compilation_folder() -> Path:
 
     A home folder may be shared by machines of different processors; code made for one may not run on another.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache")
-    base = Path(os.environ.get(FOLDER_VARIABLE) or cache / "udccal" / "compilations")
+    # A user without a home folder can name another.
+    given, cache = os.environ.get(FOLDER_VARIABLE), os.environ.get("XDG_CACHE_HOME")
+    base = Path(given) if given else Path(cache or Path.home() / ".cache") / "udccal" / "compilations"
     return base / f"{platform.machine()}-{hashlib.sha256(_processor()).hexdigest()[:12]}"
 
 

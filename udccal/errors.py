@@ -54,7 +54,7 @@ class CaptureError(UdccalError):
 
 
 class FitError(UdccalError):
-    """A fit could not be done with the data given, or ended in a bad status with ``throw=True``."""
+    """A fit could not be done with the data given, or ended in a status that ``or_raise`` refuses."""
 
 
 class RestorationError(UdccalError):

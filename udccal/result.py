@@ -11,7 +11,7 @@ from typing import Generic, Literal, Protocol, TypeVar, final, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float32
 
-from udccal.errors import FitError
+from udccal.errors import FitError, UdccalError
 
 Term = TypeVar("Term")
 _Term_co = TypeVar("_Term_co", covariant=True)
@@ -325,8 +325,16 @@ class TermResults(abc.ABC):
         """All five results, in the order of ``TermName``."""
 
     def result(self, term: str) -> FitResult:
-        """Return the result of a term by its name."""
-        return next(result for result in self.results if result.name == term)
+        """Return the result of a term by its name.
+
+        Raises:
+            UdccalError: when ``term`` is not the name of a term.
+        """
+        for result in self.results:
+            if result.name == term:
+                return result
+        names = ", ".join(result.name for result in self.results)
+        raise UdccalError(f"Expected a term, one of {names}, found '{term}'. Name one of these.")
 
     @property
     def warnings(self) -> tuple[str, ...]:

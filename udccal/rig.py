@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import reprlib
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
 
 from udccal.errors import RigError
 from udccal.rig_folders import RIG_FILE, find_rig
@@ -15,6 +18,8 @@ from udccal.rig_versions import present_rig
 CfaPattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 _MAX_TOML_BYTES = 64 * 1024
 RIG_NAME = r"^[a-z0-9][a-z0-9._-]{0,63}$"
+# What pydantic's sentences begin with.
+_SUBJECT = re.compile(r"^(Input|String)(?= should)")
 # Further mistakes that one message names.
 _MOST_MISTAKES = 20
 # 8K UHD and a little more.
@@ -182,10 +187,11 @@ def load_rig(name_or_path: str | Path) -> RigDescription:
     """Read and check a rig description.
 
     Args:
-        name_or_path: as for ``find_rig``.
+        name_or_path: name of a rig that ships with udccal, or of one of your own (in ``~/.local/share/udccal/rigs`` or
+            ``$UDCCAL_RIGS``), or the path of a folder with a ``rig.toml``.
 
     Raises:
-        RigError: when it is missing, not TOML, or a value is missing, unknown or out of range.
+        RigError: when there is no such rig, the file is not TOML, or a value is missing, unknown or out of range.
     """
     file = find_rig(name_or_path) / RIG_FILE
     raw = file.read_bytes()
@@ -201,8 +207,26 @@ def load_rig(name_or_path: str | Path) -> RigDescription:
         first, *others = error.errors()
         more = f", and {', '.join(_place(other['loc']) for other in others[:_MOST_MISTAKES])}" if others else ""
         raise RigError(
-            f"Expected a valid '{_place(first['loc'])}' in {file}, found: {first['msg']}. Correct that value{more}."
+            f"Expected a valid '{_place(first['loc'])}' in {file}, found {_found(first)}. Correct that value{more}."
         ) from error
+
+
+def _found(mistake: ErrorDetails) -> str:
+    """Say what stands where a valid value belongs, and what a valid one is."""
+    given = reprlib.repr(mistake["input"])
+    match mistake["type"]:
+        case "missing":
+            return "none"
+        case "extra_forbidden":
+            return "a name that a rig does not have"
+        case "value_error":
+            return str(mistake["ctx"]["error"])
+        case "model_type" if mistake["ctx"]["class_name"] == Nominal.__name__:
+            return f"{given} without a tolerance, where {{ value = {given}, tolerance = ... }} belongs"
+        case "model_type":
+            return f"{given}, where a section belongs"
+        case _:
+            return f"{given}: {_SUBJECT.sub('it', mistake['msg'])}"
 
 
 def _place(location: tuple[int | str, ...]) -> str:

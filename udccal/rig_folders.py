@@ -17,8 +17,8 @@ _MOST_NAMED: Final = 20
 
 def user_rig_folder() -> Path:
     """Return the folder in which a user's own rigs are looked up by name: ``UDCCAL_RIGS``, or a default."""
-    default = Path.home() / ".local" / "share" / "udccal" / "rigs"
-    return Path(os.environ.get("UDCCAL_RIGS", str(default)))
+    given = os.environ.get("UDCCAL_RIGS")
+    return Path.home() / ".local" / "share" / "udccal" / "rigs" if given is None else Path(given)
 
 
 def shipped_rig_folder() -> Path:

@@ -128,7 +128,8 @@ def test_takes_the_whole_sensor(camera: Camera, backend: Backend) -> None:
 
 def test_refuses_settings_that_it_cannot_do_and_keeps_its_own(camera: Camera, backend: Backend) -> None:
     accepted = camera.configure(backend.settings)
-    for settings in backend.refused:
+    another = replace(accepted, region=Region(8, 4, 16, 8))
+    for settings in (*backend.refused, replace(another, gain_dB=NAN), replace(another, exposure_s=-1.0)):
         with pytest.raises(CameraError, match=SENTENCE):
             camera.configure(settings)
     (frame,) = camera.frames(1)
@@ -224,6 +225,20 @@ def test_another_stream_ends_the_one_before(camera: Camera, backend: Backend) ->
         next(first)
     del first
     assert len(list(second)) == 2
+
+
+@pytest.mark.parametrize("what", ["settings", "mode"])
+def test_a_change_ends_the_stream_before(camera: Camera, backend: Backend, what: str) -> None:
+    camera.configure(backend.settings)
+    stream = camera.frames(3)
+    next(stream)
+    if what == "settings":
+        camera.configure(backend.settings)
+    else:
+        camera.set_mode(camera.mode)
+    with pytest.raises(CameraError, match=SENTENCE):
+        next(stream)
+    assert len(taken(camera, backend, 2)) == 2
 
 
 def test_a_stream_may_be_left_early(camera: Camera, backend: Backend) -> None:

@@ -122,6 +122,12 @@ def test_files_that_do_not_say_their_exposure_can_be_refused(pngs: list[Path], t
             FileCamera(paths, exposure_s=None)
 
 
+@pytest.mark.parametrize("exposure_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_an_exposure_for_all_files_that_is_none_is_refused(exposure_s: float, pngs: list[Path]) -> None:
+    with pytest.raises(CameraError, match=r"Expected an exposure above 0 s .*, found .*\. Use"):
+        FileCamera(pngs, exposure_s=exposure_s)
+
+
 def test_files_of_another_camera_are_refused(tmp_path: Path) -> None:
     for other in (Shot(serial="0043"), Shot(model="M2"), Shot(make="Other")):
         with pytest.raises(CameraError, match=r"files of one camera \(Maker M1 0042\)"):

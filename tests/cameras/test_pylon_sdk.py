@@ -64,6 +64,15 @@ def test_a_gain_without_a_unit_is_set_to_its_least() -> None:
     assert controls.read_settings(Nodes(node_map)) == Settings(0.02, 0.0, Region(8, 6, 320, 240))
 
 
+@pytest.mark.parametrize(("low_us", "high_us"), [(20.0, 16_777_215.0), (0.3, 123.0)])
+def test_both_ends_of_the_exposures_are_accepted(low_us: float, high_us: float) -> None:
+    nodes = Nodes(older_camera(ExposureTimeAbs=Number(50.0, low_us, high_us)))
+    exposures = controls.read_features(nodes).exposure_s
+    for exposure_s, exposure_us in ((exposures.low, low_us), (exposures.high, high_us)):
+        controls.write_settings(nodes, Settings(exposure_s, 0.0, Region(0, 0, 640, 480)))
+        assert nodes.number("ExposureTimeAbs") == exposure_us
+
+
 def test_mono_of_a_colour_sensor_is_no_raw_format() -> None:
     nodes = Nodes(older_camera(PixelColorFilter=Choice("BayerRG", ("BayerRG",))))
     assert controls.read_features(nodes).pixel_formats == ("BayerRG12Packed",)

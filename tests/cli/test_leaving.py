@@ -101,6 +101,20 @@ def test_ctrl_c_is_met_wherever_python_is(swallowed: str, tmp_path: Path) -> Non
     assert sentence.startswith("udccal: Stopped.")
 
 
+def test_an_output_of_few_letters_gets_what_it_can_show() -> None:
+    words = [*COMMAND, "profile", "show", "lg55-reduced"]
+    done = subprocess.run(words, capture_output=True, timeout=280, env={**os.environ, "PYTHONIOENCODING": "latin-1"})
+    assert done.returncode == 0, done.stderr
+    assert b"K_DN_per_e" in done.stdout
+
+
+def test_an_error_does_not_steer_the_terminal(tmp_path: Path) -> None:
+    done = udccal("profile", "show", tmp_path / "a\x1b[2Jb")
+    assert done.returncode == 1
+    assert "a?[2Jb" in done.stderr
+    assert "\x1b" not in done.stderr
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a file that is always full")
 @pytest.mark.parametrize("flags", [[], ["--json"]], ids=str)
 def test_a_full_disk_behind_the_output_is_a_sentence(flags: list[str]) -> None:

@@ -54,6 +54,16 @@ def test_people_get_the_table_and_no_json(capsys: pytest.CaptureFixture[str]) ->
     assert "{" not in out
 
 
+def test_what_a_file_says_does_not_steer_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    output, text = Output(), "a\x1b]0;title\x07\x1b[2J\x9b31m\rb\tc"
+    output.say(text)
+    output.answer(text)
+    output.table(Table("Notes", ("note",), ((text,),)))
+    out, err = capsys.readouterr()
+    assert not any(letter in out + err for letter in "\x1b\x07\x9b\r")
+    assert err.startswith("a?]0;title??[2J?31m?b")
+
+
 def test_what_json_cannot_hold_is_refused() -> None:
     with pytest.raises(TypeError, match="ndarray"):
         plain(np.zeros(3))

@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from udccal.cli.jobs.rigs import new_rig
+from udccal.cli.output import Output
 from udccal.errors import RigError
 from udccal.rig import load_rig
+from udccal.rig_folders import shipped_rig_folder
 
 pytestmark = pytest.mark.medium
 
@@ -47,6 +50,15 @@ def test_a_rig_is_begun_listed_and_checked(rigs: Path) -> None:
     assert follows["diameter of the entrance pupil"] == (pytest.approx(6 / 1.85), "mm")
     assert follows["field of view, across"] == (pytest.approx(60.98, abs=0.01), "deg")
     assert follows["level of a full pixel"] == (pytest.approx(3969), "DN")
+
+
+@pytest.mark.parametrize("line", ['name\t= "other"', '  name="other"', '"name" = "other"'])
+def test_a_new_rig_has_its_own_name_however_the_other_is_written(tmp_path: Path, rigs: Path, line: str) -> None:
+    text = (shipped_rig_folder() / "lg55-reduced" / "rig.toml").read_text(encoding="utf-8")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "rig.toml").write_text(text.replace('name = "lg55-reduced"', line), encoding="utf-8")
+    new_rig(Output(as_json=True), "lobby", str(tmp_path / "other"))
+    assert load_rig("lobby").name == "lobby"
 
 
 def test_names_that_are_taken_or_none_are_refused(rigs: Path) -> None:

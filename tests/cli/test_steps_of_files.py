@@ -186,6 +186,7 @@ def test_steps_that_cannot_be_captured_again_are_refused_and_change_nothing(fold
     before = (folder / "session" / "session.json").read_bytes()
     for step in (LAST, "../x"):
         assert f"Expected the step '{step}'" in refused(folder, "--again", step)
+    assert "Did you mean noise/flat_3?" in refused(folder, "--again", "noise/flt_3")
     assert "Add --term noise" in refused(folder, "--again", "noise/flat_3", term="wire")
     assert (folder / "session" / "session.json").read_bytes() == before
     shutil.rmtree(folder / "pictures" / "noise" / "flat_3")

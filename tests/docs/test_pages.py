@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import importlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -83,8 +84,10 @@ def test_pictures_are_small_and_shown() -> None:
 
 def test_the_python_page_has_every_public_name() -> None:
     page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    listed = {line.split(".")[-1] for line in page.splitlines() if line.startswith(":::")}
-    assert listed == set(udccal.__all__)
+    paths = [line.removeprefix("::: ").rsplit(".", 1) for line in page.splitlines() if line.startswith(":::")]
+    assert {name for _, name in paths} >= set(udccal.__all__)
+    for module, name in paths:
+        assert getattr(importlib.import_module(module), name).__doc__, f"{module}.{name}"
 
 
 def test_the_tables_of_tiers_are_of_one_run() -> None:

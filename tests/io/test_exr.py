@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,16 @@ def test_missing_and_foreign_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.exr").write_text("not a picture")
     with pytest.raises(FileFormatError, match=r"Expected .* OpenEXR"):
         read_exr(tmp_path / "text.exr")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_path_that_is_no_text_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="in UTF-8, found other bytes"):
+        write_exr(tmp_path / "a\udcff.exr", planes())
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a\udcff.exr").touch()
+    with pytest.raises(FileFormatError, match="Rename the folder or file"):
+        read_exr(tmp_path / "a\udcff.exr")
 
 
 def test_a_header_that_claims_a_huge_picture_is_refused_before_reading(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -63,3 +65,17 @@ def test_a_header_that_claims_a_huge_picture_is_refused_before_reading(tmp_path:
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(FileFormatError, match="at most 160000000 pixels in all, found 60000 x 30"):
         read_png16(tmp_path / "a.png")
+
+
+def test_a_colour_that_counts_as_transparent_changes_nothing(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (4, 5, 3)).astype(np.uint8)
+    write_rgb8(tmp_path / "a.png", picture)
+    content, body = (tmp_path / "a.png").read_bytes(), b"tRNS" + bytes([0, 1, 0, 2, 0, 3])
+    chunk = struct.pack(">I", 6) + body + struct.pack(">I", zlib.crc32(body))
+    (tmp_path / "a.png").write_bytes(content[:33] + chunk + content[33:])
+    np.testing.assert_array_equal(read_rgb8(tmp_path / "a.png"), picture)
+
+
+def test_samples_in_another_order_of_bytes_are_the_same(tmp_path: Path, mosaic: np.ndarray) -> None:
+    write_png16(tmp_path / "a.png", mosaic.astype(">u2"))
+    np.testing.assert_array_equal(read_png16(tmp_path / "a.png"), mosaic)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import os
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -7,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from udccal.errors import ProfileError
-from udccal.profiles.archive import unpack_archive
+from udccal.profiles.archive import pack_archive, unpack_archive
 
 
 def archive_with(path: Path, *names: str, content: bytes = b"{}") -> Path:
@@ -127,4 +129,26 @@ def test_a_long_list_of_files_is_refused_before_it_is_read(tmp_path: Path, targe
         content = path.read_bytes()
         path.write_bytes(content[:-22] + b"PK\6\7" + bytes(16) + content[-22:])
     with pytest.raises(ProfileError, match="short list of files"):
+        unpack_archive(path, target)
+
+
+def test_files_from_before_1980_are_packed(tmp_path: Path, target: Path) -> None:
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p" / "profile.json").write_text("{}")
+    os.utime(tmp_path / "p" / "profile.json", (3600, 3600))
+    pack_archive(tmp_path / "p", tmp_path / "p.zip")
+    unpack_archive(tmp_path / "p.zip", target)
+    assert (target / "profile.json").read_text() == "{}"
+
+
+def test_a_full_disk_is_not_taken_for_a_damaged_file(
+    tmp_path: Path, target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = archive_with(tmp_path / "p.zip", "profile.json")
+
+    def full(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("udccal.profiles.archive._unpack_entry", full)
+    with pytest.raises(ProfileError, match=r"found: No space left on device\. Free some space there"):
         unpack_archive(path, target)

@@ -12,13 +12,20 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from udccal.errors import FitError, ProfileError
+from udccal.errors import FileFormatError, FitError, ProfileError
 from udccal.io.exr import write_exr
 from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, profile_sha256
 from udccal.profiles.schema import PictureName, StoredProfile
-from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile, read_stored, write_profile
+from udccal.profiles.store import (
+    RIG_PROFILE,
+    check_replaceable,
+    find_profile,
+    read_profile,
+    read_stored,
+    write_profile,
+)
 from udccal.result import FitStatus
 from udccal.rig import load_rig
 from udccal.rig_folders import shipped_rig_folder
@@ -108,6 +115,25 @@ def test_a_folder_with_anything_else_is_left_alone(stored: Path, toy_profile: Pr
     with pytest.raises(ProfileError, match="Choose another path"):
         write_profile(other, toy_profile)
     assert (other / "photo.png").read_text() == "mine"
+
+
+@pytest.mark.parametrize("place", [".", "..", "/"])
+def test_a_place_without_a_name_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ProfileError, match="Give the profile a name"):
+        check_replaceable(Path(place))
+
+
+def test_a_path_that_is_no_text_is_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="in UTF-8, found other bytes"):
+        check_replaceable(tmp_path / "p\udcff")
+
+
+def test_a_file_of_a_profile_is_not_taken_for_a_zip_file(stored: Path) -> None:
+    with pytest.raises(ProfileError, match="one of its files"):
+        read_profile(stored / PROFILE_NAME)
 
 
 def test_a_failed_write_leaves_nothing(tmp_path: Path, toy_profile: Profile) -> None:

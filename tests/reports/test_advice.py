@@ -76,6 +76,14 @@ def test_what_was_not_captured_is_asked_for_by_its_command(whole: Profile) -> No
     )
 
 
+@pytest.mark.parametrize("term", ["wire", "psf", "backscatter"])
+def test_a_poor_fit_without_the_lens_asks_for_the_geometry(whole: Profile, term: str) -> None:
+    found = advice(ended(whole, geometry=FitStatus.NOT_CAPTURED, **{term: FitStatus.POOR_FIT}))
+    assert found.sentences[0].startswith(f"Capture geometry, then fit {term} again")
+    found = advice(ended(whole, geometry=FitStatus.NOT_CAPTURED, noise=FitStatus.POOR_FIT))
+    assert found.sentences[0].startswith("For noise, compare rig.toml")
+
+
 def test_what_is_to_be_done_comes_before_what_is_good_to_know(whole: Profile) -> None:
     found = advice(ended(whole, psf=FitStatus.NOT_CONVERGED, wire=FitStatus.NOT_CAPTURED))
     assert [sentence.split()[0] for sentence in found.sentences] == ["Look", "Capture", "Until"]

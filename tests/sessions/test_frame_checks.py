@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,6 +48,17 @@ def test_a_steady_scene_of_any_shape_loses_no_frame() -> None:
     assert average_of([light()] * 60, 60) == {}
     assert average_of([0.02 * light()] * 30, 30) == {}  # mostly read noise
     assert average_of([np.zeros((ROWS, COLUMNS))] * 30, 30) == {}
+
+
+def test_samples_in_another_order_of_bytes_are_the_same() -> None:
+    frames = [frame(light(), index) for index in range(10)]
+    turned = [replace(one, data=one.data.astype(">u2")) for one in frames]
+    a, b = (
+        average_frames(lambda _, given=given: iter(given), 10, FrameChecks(LIMITS, SETTINGS))
+        for given in (frames, turned)
+    )
+    np.testing.assert_array_equal(a.mean, b.mean)
+    np.testing.assert_array_equal(a.variance, b.variance)
 
 
 @pytest.mark.parametrize("place", [0, 2, 20])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -134,6 +135,21 @@ def test_going_on_with_a_session_follows_no_link(session: Path, home: Path, lay:
 
 def _private(path: Path) -> bool:
     return PRIVATE in path.read_bytes()
+
+
+@pytest.mark.parametrize("target", ["home", "session/noise"])
+def test_a_step_captured_again_removes_nothing_behind_a_link(session: Path, home: Path, target: str) -> None:
+    other = session.parent / target
+    (other / "photo.png").write_bytes(PRIVATE)
+    (session / "album").symlink_to(other)
+    manifest = json.loads((session / "session.json").read_text())
+    del manifest["manifest_sha256"]
+    manifest["steps"][0]["captures"][0]["file"] = "album/photo.png"
+    (session / "session.json").write_text(json.dumps(manifest))
+    with SessionWriter.resume(session) as writer:
+        assert [damage.file for damage in writer.damage] == ["album/photo.png"]
+        writer.add_step("noise/dark_0", "noise", DarkSubject(), [WHOLE])
+    assert (other / "photo.png").read_bytes() == PRIVATE
 
 
 @pytest.mark.parametrize("lay", [damaged_leads_out, manifest_leads_out, manifest_leads_to_a_manifest])

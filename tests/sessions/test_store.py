@@ -150,6 +150,8 @@ def test_a_picture_of_another_size_is_refused(folder: Path) -> None:
         (lambda m: m["steps"][0]["captures"][0].update(file="../../etc/x.png"), r"file' .* found '../../etc/x.png'"),
         (lambda m: m["steps"][0]["captures"][0].update(file="/etc/x.png"), r"file' .* found '/etc/x.png'"),
         (lambda m: m["steps"][0]["captures"][0].update(frames=2), "frames = 1 for a single frame"),
+        (lambda m: m["steps"][0]["captures"][0].update(frames=10**15), r"captures.0.frames' .* equal to 1048576"),
+        (lambda m: m["steps"][0]["captures"][0].update(gain_dB=300.0), r"captures.0.gain_dB' .* equal to 200"),
         (lambda m: m["steps"][0]["captures"][0].update(kind="average"), "a file ending in .exr"),
         (lambda m: m["steps"][0]["captures"][0]["region"].update(x=1), r"region.x' .* multiple of 2"),
         (lambda m: m["steps"][0]["captures"][0]["region"].update(x=1000), "regions inside the sensor"),

@@ -54,6 +54,14 @@ def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:
     assert [item.name for item in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+@pytest.mark.parametrize("serial", ["1" * 101, "\udcff"])
+def test_a_camera_that_says_too_much_of_itself_is_refused(tmp_path: Path, serial: str) -> None:
+    with pytest.raises(SessionError, match="Expected the 'serial' of the camera to be a text of at most 100"):
+        SessionWriter.create(tmp_path, RIG, replace(CAMERA, serial=serial))
+    with SessionWriter.create(tmp_path, RIG, CAMERA) as writer:
+        assert writer.manifest.steps == ()
+
+
 def test_a_session_is_resumed_not_overwritten(tmp_path: Path) -> None:
     with SessionWriter.create(tmp_path, RIG, CAMERA) as writer:
         writer.add_step("noise/dark_0", "noise", DarkSubject(), [frame()])

@@ -58,5 +58,8 @@ def simulate(rig: RigDescription, seed: int = 0, noise_seed: int | None = None) 
         rig: description; the simulated rig differs from it within its tolerances.
         seed: chooses the specimen and its noise.
         noise_seed: chooses the noise alone: the same rig on another day.
+
+    Returns:
+        a context that opens the bench: camera, display, stage and clock. Simulated exposures take no real time.
     """
     return simulated_bench(simulated_rig(rig, seed, noise_seed))

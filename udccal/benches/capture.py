@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from udccal.benches.bench import CaptureBench
+from udccal.errors import UdccalError
 from udccal.plugins import find_procedure
 from udccal.sessions.changes import Exchanged
 from udccal.sessions.schema import TermName
@@ -20,7 +21,7 @@ TERMS: tuple[TermName, ...] = get_args(TermName)
 def capture(
     path: str | Path,
     bench: CaptureBench,
-    terms: Iterable[TermName] = TERMS,
+    terms: str | Iterable[str] = TERMS,
     progress: Callable[[TermName, int, int | None], None] = lambda term, done, total: None,
     exchanged: Set[Exchanged] = frozenset(),
 ) -> Session:
@@ -31,17 +32,22 @@ def capture(
     Args:
         path: folder of the session; created if missing.
         bench: camera, display and stage, such as ``udccal.simulate`` returns.
-        terms: terms to capture, in any order.
+        terms: one term or several, in any order, of noise, geometry, wire, psf and backscatter.
         progress: gets the term, the number of steps done, and their total.
-        exchanged: parts of the rig that were exchanged on purpose since the session began.
+        exchanged: parts of the rig that were exchanged on purpose since the session began: ``camera``, ``lens``.
+
+    Returns:
+        the session, open for reading.
 
     Raises:
-        UdccalError: when a procedure is not installed.
+        UdccalError: when a procedure is not installed, or one of ``terms`` is not the name of a term.
         CameraError: when the camera does not fit the rig.
         CaptureError: when the camera does not see what a step needs.
         SessionError: when the folder holds another rig's or camera's session, or another process writes to it.
     """
-    wanted = set(terms)
+    wanted = {terms} if isinstance(terms, str) else set(terms)
+    if unknown := wanted - set(TERMS):
+        raise UdccalError(f"Expected terms, of {', '.join(TERMS)}, found '{min(unknown)}'. Name some of these.")
     with SessionWriter.create_or_resume(Path(path), bench.rig, bench.camera.identity, exchanged, bench.now) as writer:
         for term in (name for name in TERMS if name in wanted):
             capture_term(writer, bench, term, partial(progress, term))

@@ -55,9 +55,14 @@ class FileCamera:
             exposure_s: exposure of files that do not contain it; None to refuse these.
 
         Raises:
-            CameraError: when there are no files, or one does not contain its exposure and ``exposure_s`` is None.
+            CameraError: when there are no files, one does not contain its exposure and ``exposure_s`` is None, or
+                ``exposure_s`` is no exposure.
             FileFormatError: when a file cannot be read.
         """
+        if exposure_s is not None and not 0 < exposure_s < math.inf:
+            raise CameraError(
+                f"Expected an exposure above 0 s for files that do not contain theirs, found {exposure_s:g} s. Use 1 s."
+            )
         self._layout, self._exposure_s = _layout(cfa, bits), exposure_s
         listed = _listed(source)
         self._maker = facts = read_facts(listed[0].path)
@@ -149,6 +154,7 @@ class FileCamera:
         """
         self._check_open()
         check_mode(mode, self.features)
+        self._stream += 1
         return self._mode
 
     def configure(self, settings: Settings) -> Settings:
@@ -170,6 +176,7 @@ class FileCamera:
         chosen = (best.gain_dB, best.exposure_s)
         self._queue = tuple(shot for shot in self._shots if (shot.gain_dB, shot.exposure_s) == chosen)
         self._next, self._taken_s = 0, -math.inf
+        self._stream += 1
         return Settings(best.exposure_s, best.gain_dB, settings.region)
 
     def frames(self, count: int) -> Iterator[Frame]:

@@ -110,6 +110,7 @@ class SimulatedCamera:
         self._check_open()
         check_mode(mode, self.features)
         self._mode = mode
+        self._stream += 1
         return mode
 
     def configure(self, settings: Settings) -> Settings:
@@ -121,6 +122,7 @@ class SimulatedCamera:
         self._check_open()
         check_settings(settings, self.features, self.sensor)
         self._settings = settings
+        self._stream += 1
         return settings
 
     def frames(self, count: int) -> Iterator[Frame]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from contextlib import suppress
 
+from udccal.cli.shown_text import shown
 from udccal.errors import UdccalError
 
 _GLOBAL_FLAGS = ("--json", "--debug")
@@ -21,6 +23,8 @@ def main(arguments: list[str] | None = None) -> None:
     # Silences XLA's own log before JAX is imported: whatever matters in it also comes as an exception.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal or file of few letters gets question marks for the rest
     try:
         try:
             _run(given)
@@ -85,7 +89,7 @@ def _fail(sentence: str, status: int, given: list[str]) -> None:
 
         with suppress(OSError):  # standard output may be what failed
             print(json.dumps({"error": sentence}), flush=True)
-    print(f"udccal: {' '.join(sentence.split())}", file=sys.stderr, flush=True)
+    print(f"udccal: {shown(' '.join(sentence.split()))}", file=sys.stderr, flush=True)
     # An interrupt while Python runs text, as it does to make a dataclass, marks the process as ended by the signal,
     # even where it was caught. Running text once more takes the mark back: the status is the one given here.
     exec("")

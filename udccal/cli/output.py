@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 
+from udccal.cli.shown_text import shown
 from udccal.errors import UdccalError
 from udccal.reports.tables import Table
 
@@ -45,7 +46,7 @@ class Stage:
         """Move the bar to ``done`` of ``total`` and show what is being done."""
         self._bar.update(self._task, completed=done, total=total)
         if text is not None:
-            self._bar.update(self._task, description=text)
+            self._bar.update(self._task, description=shown(text))
 
 
 @dataclass
@@ -71,7 +72,7 @@ class Output:
 
     def say(self, sentence: str) -> None:
         """Print a sentence for the user on standard error."""
-        self._people.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        self._people.print(shown(sentence), highlight=False, markup=False, soft_wrap=True)
 
     def ask(self, question: str) -> str:
         """Ask the user and wait for a line without a time limit; the progress bar pauses meanwhile.
@@ -82,7 +83,7 @@ class Output:
         if self._bar is not None:
             self._bar.stop()
         try:
-            self._people.print(question, end=" ", highlight=False, markup=False, soft_wrap=True)
+            self._people.print(shown(question), end=" ", highlight=False, markup=False, soft_wrap=True)
             return input()
         except EOFError as error:
             raise UdccalError(
@@ -108,17 +109,17 @@ class Output:
         """Print a table on standard output; print nothing with ``--json`` and ``--json-events``."""
         if self.as_json or self.events:
             return
-        shown = RichTable(title=table.title, title_justify="left", title_style="bold")
+        drawn = RichTable(title=table.title, title_justify="left", title_style="bold")
         for index, column in enumerate(table.columns):
-            shown.add_column(column, justify="right" if index in table.right else "left")
+            drawn.add_column(column, justify="right" if index in table.right else "left")
         for row in table.rows:
-            shown.add_row(*row)
-        self._standard.print(shown, markup=False)
+            drawn.add_row(*map(shown, row))
+        self._standard.print(drawn, markup=False)
 
     def answer(self, sentence: str) -> None:
         """Print a sentence that is part of the result on standard output; print nothing where a table is not."""
         if not (self.as_json or self.events):
-            self._standard.print(sentence, highlight=False, markup=False, soft_wrap=True)
+            self._standard.print(shown(sentence), highlight=False, markup=False, soft_wrap=True)
 
     def result(self, result: object) -> None:
         """Print the result (a dataclass) as JSON on standard output; print nothing without ``--json``."""
@@ -137,7 +138,7 @@ class Output:
         start = time.perf_counter()
         columns = (
             SpinnerColumn(),
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),

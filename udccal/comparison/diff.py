@@ -111,7 +111,11 @@ def diff(a: Profile, b: Profile, limits: DiffLimits | None = None) -> ProfileDif
 
     Args:
         a, b: profiles, in either order: all but the signs is the same for B and A.
-        limits: thresholds of the verdicts.
+        limits: thresholds of the verdicts; None for those of docs/diff.md.
+
+    Returns:
+        a verdict per term and of the whole, with the numbers behind it. The first comparison compiles for half a
+        minute.
 
     Raises:
         ProfileError: when they are of different rigs or cameras, hold a covariance that cannot be one, or terms that

@@ -119,7 +119,7 @@ def check_measured(profile: Profile) -> None:
     missing = [one.name for one in (profile.noise, profile.wire, profile.backscatter) if one.unfitted]
     if missing:
         raise ProfileError(
-            f"Expected a profile with noise, wire and backscatter as measured, found none of {' and '.join(missing)}. "
+            f"Expected a profile with noise, wire and backscatter as measured, found no {' and no '.join(missing)}. "
             "Calibrate these terms first: the check compares with them."
         )
 

@@ -30,9 +30,10 @@ def read_exr(path: Path, shape: Shape | None = None) -> dict[str, Float32[np.nda
         shape: expected (rows, columns); files of another shape, or with more than three channels, are not decoded.
 
     Raises:
-        FileFormatError: when the file is missing, truncated, too large or of another shape, or has subsampled channels
-            or values that are not finite.
+        FileFormatError: when the file is missing, truncated, too large or of another shape, has subsampled channels or
+            values that are not finite, or its path is not text.
     """
+    check_path(path)
     try:
         names = _checked_channel_names(path, shape)
         with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -58,7 +59,8 @@ def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "rows columns
 
     Raises:
         OSError: when the disk is full or cannot be written to.
-        FileFormatError: when there is nothing to write, sizes differ or are out of bounds, or a value is not finite.
+        FileFormatError: when there is nothing to write, sizes differ or are out of bounds, a value is not finite, or
+            the path is not text.
     """
     planes = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in channels.items()}
     shapes = {plane.shape for plane in planes.values()}
@@ -70,6 +72,7 @@ def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "rows columns
         if not np.isfinite(plane).all():
             raise FileFormatError(f"Expected finite numbers in channel '{name}' of {path}, found NaN or infinity.")
     header = {"compression": _COMPRESSION, "type": OpenEXR.scanlineimage}
+    check_path(path)
     with atomic_path(path) as temporary, OpenEXR.File(header, planes) as file:
         try:
             file.write(str(temporary))
@@ -104,6 +107,20 @@ def write_rgb_exr(path: Path, picture: Float[np.ndarray, "rows columns 3"]) -> N
         OSError, FileFormatError: as ``write_exr``.
     """
     write_exr(path, {name: picture[..., index] for index, name in enumerate("RGB")})
+
+
+def check_path(path: Path) -> None:
+    """Refuse a path that is not text in UTF-8, which the library cannot open.
+
+    Raises:
+        FileFormatError: when it is not.
+    """
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise FileFormatError(
+            f"Expected the path of an EXR file in UTF-8, found other bytes in {path}. Rename the folder or file."
+        ) from error
 
 
 def _checked_channel_names(path: Path, shape: Shape | None) -> list[str]:

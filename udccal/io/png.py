@@ -72,7 +72,9 @@ def read_rgb8(path: Path, shape: Shape | None = None) -> UInt8[np.ndarray, "rows
     Raises:
         FileFormatError: when the file is missing, truncated, too large, of another shape, or not 8-bit RGB.
     """
-    return np.ascontiguousarray(_read(path, 8, _RGB, "an 8-bit RGB PNG", shape)[..., ::-1])
+    picture = _read(path, 8, _RGB, "an 8-bit RGB PNG", shape)
+    # Blue, green, red; where the file names a colour that is transparent, OpenCV adds a fourth channel.
+    return np.ascontiguousarray(picture[..., 2::-1])
 
 
 def write_rgb8(path: Path, picture: UInt8[np.ndarray, "rows columns 3"]) -> None:
@@ -91,7 +93,9 @@ def write_rgb8(path: Path, picture: UInt8[np.ndarray, "rows columns 3"]) -> None
 
 def _write(path: Path, picture: np.ndarray, parameters: list[int]) -> None:
     check_size(path, picture.shape[0], picture.shape[1])
-    done, encoded = cv2.imencode(".png", picture, parameters)
+    # OpenCV takes every array for one in the processor's order of bytes.
+    own = picture.astype(picture.dtype.newbyteorder("="), copy=False)
+    done, encoded = cv2.imencode(".png", own, parameters)
     if not done:
         raise FileFormatError(f"Expected to encode {path} as PNG, found that OpenCV could not.")
     write_atomically(path, encoded.tobytes())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import struct
 import tempfile
@@ -38,12 +39,14 @@ _DAMAGES = (
     RuntimeError,
     ValueError,
 )
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 
 def pack_archive(folder: Path, path: Path) -> None:
     """Write the files of a profile's folder to one new zip file. EXR files are already compressed and are stored."""
     files = sorted(folder.iterdir())
-    with zipfile.ZipFile(path, "x") as archive:
+    # A computer without a battery for its clock begins in 1970, which zip files cannot hold: 1980 is written then.
+    with zipfile.ZipFile(path, "x", strict_timestamps=False) as archive:
         for file in files:
             kind = zipfile.ZIP_STORED if file.suffix == ".exr" else zipfile.ZIP_DEFLATED
             archive.write(file, file.name, compress_type=kind)
@@ -58,11 +61,15 @@ def unpacked(path: Path, only: str | None = None) -> Iterator[Path]:
         only: the one file that is needed; None for all.
 
     Raises:
-        ProfileError: as ``unpack_archive``.
+        ProfileError: as ``unpack_archive``, and when ``path`` is the ``profile.json`` of a folder.
     """
     if not path.is_file():
         yield path
         return
+    if path.name == PROFILE_NAME:
+        raise ProfileError(
+            f"Expected a profile's folder or zip file, found {path}, one of its files. Name the folder, {path.parent}."
+        )
     with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
         unpack_archive(path, Path(folder), only)
         yield Path(folder)
@@ -73,7 +80,7 @@ def unpack_archive(path: Path, folder: Path, only: str | None = None) -> None:
 
     Raises:
         ProfileError: when the file is damaged or not a zip file, holds a name that no profile has (folders, ``..``,
-            absolute paths, links), or would unpack to more than a profile can hold.
+            absolute paths, links), or would unpack to more than a profile can hold; also when the disk is full.
     """
     try:
         _check_list(path)
@@ -83,6 +90,11 @@ def unpack_archive(path: Path, folder: Path, only: str | None = None) -> None:
             for entry in (entry for entry in entries if only in (None, entry.filename)):
                 _unpack_entry(path, archive, entry, folder / entry.filename)
     except _DAMAGES as error:
+        if isinstance(error, OSError) and error.errno in _NO_ROOM:
+            raise ProfileError(
+                f"Expected room to unpack {path} into {folder}, found: {error.strerror}. Free some space there, or set "
+                "TMPDIR to a folder on another disk."
+            ) from error
         raise ProfileError(f"Expected {path} to be a whole zip file, found: {error}. Copy it again.") from error
 
 

@@ -38,7 +38,10 @@ def provenance_now(session_manifest: Path | None, camera: StoredCamera | None) -
 
 
 def portable_command(arguments: list[str]) -> str:
-    """Return a command line with absolute paths cut to their last name, so that it says nothing about the machine."""
+    """Return a command line with absolute paths cut to their last name, so that it says nothing about the machine.
+
+    Names that are not text become question marks, as ``as_text`` says.
+    """
 
     def portable(argument: str) -> str:
         option, equals, value = argument.partition("=")
@@ -46,7 +49,12 @@ def portable_command(arguments: list[str]) -> str:
             return f"{option}={portable(value)}"
         return PurePath(argument).name if Path(argument).is_absolute() else argument
 
-    return " ".join(portable(argument) for argument in arguments)
+    return as_text(" ".join(portable(argument) for argument in arguments))
+
+
+def as_text(name: str) -> str:
+    """Return a name with question marks for bytes that are not UTF-8, which a file's name may have and JSON may not."""
+    return name.encode("utf-8", "replace").decode("utf-8")
 
 
 def profile_sha256(folder: Path) -> str:

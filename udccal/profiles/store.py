@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from udccal.errors import ProfileError, RigError
 from udccal.io.atomic import write_atomically
+from udccal.io.exr import check_path
 from udccal.io.links import is_plain_file
 from udccal.io.out_folder import storing_in
 from udccal.io.whole_folder import folder_beside, read_standing, replace_whole, standing
@@ -158,7 +159,7 @@ def read_stored(folder: Path) -> StoredProfile:
         return StoredProfile.model_validate_json(json.dumps(current), strict=True)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
+        where = ".".join(str(part) for part in first["loc"]) or "profile"
         raise ProfileError(
             f"Expected a valid '{where}' in {file}, found: {first['msg']}. Restore it from a copy."
         ) from error
@@ -168,8 +169,15 @@ def check_replaceable(path: Path) -> None:
     """Refuse a ``path`` that ``write_profile`` would refuse; call it before the work that leads to a profile.
 
     Raises:
-        ProfileError: when ``path`` holds something other than a profile.
+        ProfileError: when ``path`` holds something other than a profile, or has no name by which it can be replaced.
+        FileFormatError: when it has bytes that are not UTF-8.
     """
+    if path.name in ("", ".."):
+        raise ProfileError(
+            f"Expected the name of a folder to write, found '{path}', which cannot be replaced as a whole. Give the "
+            "profile a name."
+        )
+    check_path(path.absolute())
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     try:

@@ -15,6 +15,8 @@ _MORE = {
     "psf": "the LED at more places and shifts",
     "backscatter": "more pictures on the panel",
 }
+# Terms whose fits contain the geometry.
+_ON_GEOMETRY = ("wire", "psf", "backscatter")
 _IN_THE_MEANTIME = "Until then restore with this profile: its error bars include what is wrong."
 _UNTIL = (
     "Restore with this profile until the lens is refocused or exchanged, the camera or the panel moves, or the panel's "
@@ -32,7 +34,7 @@ def advice(results: TermResults) -> Advice:
     doubtful = [one.name for one in results.results if one.warning]
     missing = [one.name for one in results.results if one.status is FitStatus.NOT_CAPTURED]
     noted = [one.name for one in results.results if one.notes and one.usable and not one.unfitted]
-    to_do = [_mend(term, results.result(term).status) for term in (*failed, *doubtful)]
+    to_do = [_mend(term, results.result(term).status, "geometry" in missing) for term in (*failed, *doubtful)]
     if missing:
         again = " ".join(f"--term {term}" for term in missing)
         to_do.append(f"Capture {_listed(missing)}, where nobody looked yet: udccal calibrate with {again}.")
@@ -57,8 +59,8 @@ def _headline(failed: list[str], doubtful: list[str], missing: list[str]) -> str
     return f"{said} Not captured: {', '.join(missing)}." if missing else said
 
 
-def _mend(term: str, status: FitStatus) -> str:
-    """Say how a fit that did not end well is mended."""
+def _mend(term: str, status: FitStatus, lens_unknown: bool) -> str:
+    """Say how a fit that did not end well is mended; ``lens_unknown``: the geometry was not captured."""
     match status:
         case FitStatus.TOO_FEW_DATA:
             return f"For {term}, capture {_MORE[term]}: there are too few data."
@@ -68,6 +70,11 @@ def _mend(term: str, status: FitStatus) -> str:
             return f"Capture {term} again with more light or a longer exposure: noise hides it."
         case FitStatus.NOT_CONVERGED:
             return f"Look at the residuals of {term} before you rely on it: its fit stopped early."
+        case _ if lens_unknown and term in _ON_GEOMETRY:
+            return (
+                f"Capture geometry, then fit {term} again: its model does not describe the data with the lens and the "
+                "tilt of rig.toml."
+            )
         case _:
             return (
                 f"For {term}, compare rig.toml with the rig, and capture it again if something moved or stood in the "

@@ -19,7 +19,7 @@ def restore(
     exposure_s: float,
     profile: Profile | str | Path,
     panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None,
-    tier: Tier = Tier.balanced,
+    tier: Tier | str = Tier.balanced,
 ) -> Picture:
     """Restore one frame. Most of the time goes into preparing the profile: for several frames, keep a ``Restorer``.
 
@@ -28,7 +28,7 @@ def restore(
         exposure_s: exposure time of the frame in s.
         profile: the rig as measured; or a profile's path, or the name of a rig that has one.
         panel_picture: what the panel showed, 8-bit RGB (a black picture when it was off); None when not known.
-        tier: how much is done to the frame.
+        tier: how much is done to the frame; preview, fast, balanced or accurate.
 
     Returns:
         the clean picture on the virtual view: (rows, columns, 3), linear RGB in e-/s.

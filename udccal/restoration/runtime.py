@@ -98,11 +98,17 @@ class Restorer:
     def load(
         cls,
         profile: str | Path,
-        tier: Tier = Tier.balanced,
+        tier: Tier | str = Tier.balanced,
         options: PlanOptions | None = None,
         keep: Path | None = None,
     ) -> Restorer:
-        """Read a profile, by path or by the name of a rig that has one, and prepare it as ``from_profile`` does.
+        """Read a profile, and prepare it.
+
+        Args:
+            profile: path of a folder or a zip file, or the name of a rig that has a profile.
+            tier: how much is done to a frame; preview, fast, balanced or accurate.
+            options: accuracy against time within the tier.
+            keep: as for ``from_profile``.
 
         Raises:
             ProfileError: when it cannot be read.
@@ -123,7 +129,7 @@ class Restorer:
 
         Args:
             profile: the rig as measured.
-            tier: how much is done to a frame.
+            tier: how much is done to a frame; preview, fast, balanced or accurate.
             options: accuracy against time within the tier.
             keep: folder that keeps what is computed, so that the next start of a program reads it instead; None to
                 keep nothing. ``prepared_folder()`` is the one of the ``udccal`` command.
@@ -132,7 +138,7 @@ class Restorer:
 
         Raises:
             RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
-                finite, or options are no ``PlanOptions``.
+                finite, there is no such tier, or options are no ``PlanOptions``.
         """
         options, tier = checked_options(options), tier_named(tier)
         rig, geometry = profile.rig, profile.geometry.term
@@ -194,7 +200,7 @@ class Restorer:
 
         Args:
             mosaic: raw frame in DN.
-            exposure_s: exposure time of the frame.
+            exposure_s: exposure time of the frame in s.
             panel_picture: what the panel showed, 8-bit RGB (a black picture when it was off); None when not known.
 
         Returns:
@@ -269,7 +275,7 @@ class Restorer:
 
         Args:
             mosaic: raw frame in DN.
-            exposure_s: exposure time of the frame.
+            exposure_s: exposure time of the frame in s.
             tone: exposure and colour gains, such as ``Tone(display_exposure(picture))`` of an earlier picture.
             panel_picture: as for ``restore``.
 

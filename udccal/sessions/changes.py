@@ -6,6 +6,8 @@ import enum
 from collections.abc import Iterator, Set
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from udccal.cameras.protocol import CameraIdentity
 from udccal.errors import SessionError
 from udccal.rig import RigDescription
@@ -20,8 +22,19 @@ class Exchanged(enum.StrEnum):
 
 
 def stored_camera(camera: CameraIdentity) -> StoredCamera:
-    """Return a camera's identity in the form of the manifest."""
-    return StoredCamera(vendor=camera.vendor, model=camera.model, serial=camera.serial, backend=camera.backend)
+    """Return a camera's identity in the form of the manifest.
+
+    Raises:
+        SessionError: when it does not fit there.
+    """
+    try:
+        return StoredCamera(vendor=camera.vendor, model=camera.model, serial=camera.serial, backend=camera.backend)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise SessionError(
+            f"Expected the '{first['loc'][0]}' of the camera to be a text of at most 100 characters, found "
+            f"{first['input']!r:.60}. Correct what the camera's program says of it."
+        ) from error
 
 
 def admit(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import cv2
@@ -108,7 +108,7 @@ class FrameChecks:
     def sound(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Yield the frames of one delivery that have no fault of their own, without comparing them with others."""
         last_id: int | None = None
-        for frame in frames:
+        for frame in map(_in_own_order, frames):
             reason = self._fault(frame, last_id)
             last_id = frame.frame_id if last_id is None else max(last_id, frame.frame_id)
             if reason is None:
@@ -190,6 +190,12 @@ def frames_agree(frames: Iterable[Frame], black_DN: float, tolerance: float) -> 
     """
     means = [cv2.mean(frame.data)[0] - black_DN for frame in frames]
     return max(means) - min(means) <= max(tolerance * max(means), 0.5)
+
+
+def _in_own_order(frame: Frame) -> Frame:
+    """The frame with samples in the processor's order of bytes, which OpenCV takes for granted."""
+    own = frame.data.dtype.newbyteorder("=")
+    return frame if frame.data.dtype == own else replace(frame, data=frame.data.astype(own))
 
 
 def _same(found: Settings, expected: Settings) -> bool:

@@ -44,9 +44,9 @@ class StoredCapture(_Strict):
     kind: Literal["frame", "average"]
     file: RelativePath
     sha256: Sha256
-    frames: Annotated[int, Field(ge=1)]
+    frames: Annotated[int, Field(ge=1, le=2**20)]
     exposure_s: Annotated[float, Field(gt=0)]
-    gain_dB: float
+    gain_dB: Annotated[float, Field(ge=-200, le=200)]
     region: StoredRegion
     first_timestamp_s: float
     last_timestamp_s: float

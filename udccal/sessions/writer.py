@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from udccal.cameras.protocol import CameraIdentity
 from udccal.errors import SessionError
+from udccal.io.links import is_plain_file
 from udccal.rig import RigDescription
 from udccal.sessions.captured import Capture
 from udccal.sessions.changes import Exchanged, admit, stored_camera
@@ -248,8 +249,10 @@ class SessionWriter:
         self._invalid.discard(step_id)
         self.again -= {step_id, *without}
         for name in _files(before) - _files(manifest):
-            with suppress(OSError):  # a file that stays does no harm
-                (self.path / name).unlink()
+            file = self.path / name
+            if is_plain_file(self.path, file):  # what is behind a link is not the session's
+                with suppress(OSError):  # a file that stays does no harm
+                    file.unlink()
         return step
 
     def _stem(self, step_id: str) -> str:

@@ -50,7 +50,10 @@ def compare_sessions(session: Session, against: Session, limits: ValidationLimit
     Args:
         session: one session.
         against: another one of the same rig and camera.
-        limits: of the checks.
+        limits: of the checks; None for those of docs/validate.md.
+
+    Returns:
+        every check with its value, its limit and one sentence.
 
     Raises:
         SessionError: when they are of different rigs or cameras, are the same one, or share no captures, or when a

@@ -63,7 +63,10 @@ def validate(profile: Profile, session: Session, limits: ValidationLimits | None
     Args:
         profile: of the same rig and camera.
         session: best one that the profile was not fitted to.
-        limits: of the checks.
+        limits: of the checks; None for those of docs/validate.md.
+
+    Returns:
+        every check with its value, its limit and one sentence.
 
     Raises:
         ProfileError: when the session is of another rig or camera.

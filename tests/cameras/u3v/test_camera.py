@@ -318,7 +318,7 @@ def test_every_alignment_of_transfers(alignment: int) -> None:
             np.testing.assert_array_equal(frame.data, sent(device, frame, i, "BayerRG12p"))
 
 
-@pytest.mark.parametrize("max_transfer", [76, 128, 65_536])
+@pytest.mark.parametrize("max_transfer", [48, 76, 128, 65_536])
 def test_every_length_of_messages(max_transfer: int) -> None:
     with U3vCamera(backend=VirtualBackend([VirtualCamera(CameraModel(max_transfer=max_transfer))])) as camera:
         assert camera.configure(SETTINGS).region == REGION

@@ -136,7 +136,6 @@ def test_patience_is_bounded_in_count_and_time() -> None:
         lambda i, p: [b"U3VD" + obedient(i, p)[0][4:]],  # type: ignore[index]
         lambda i, p: [obedient(i, p)[0][:7]],  # type: ignore[index]
         lambda i, p: [header(0x0803, i, 4) + b"\0\0\4\0"],  # acknowledge of a write
-        lambda i, p: [header(0x0801, i, 0, status=0x8007)],  # busy
         lambda i, p: [header(0x0805, i, 0)],  # pending without a time
     ],
 )
@@ -151,6 +150,19 @@ def test_tries_again_twice(fault: Callable[[int, bytes], list[Answer]]) -> None:
     with pytest.raises(CameraError, match=SENTENCE):
         ControlChannel(link, 2.0).read(8, 4)
     assert len(link.sent) == 3
+
+
+def test_a_busy_device_is_asked_again_until_the_time_out() -> None:
+    def busy(request_id: int, packet: bytes) -> list[Answer]:
+        return [header(0x0801, request_id, 0, status=0x8007)]
+
+    link = Link(*[busy] * 8)
+    channel = ControlChannel(link, 2.0)
+    assert channel.read(8, 4) == MEMORY[8:12]
+    # It has refused, and so executed none of them.
+    assert (len(link.sent), channel.resent) == (9, 0)
+    with pytest.raises(CameraError, match="BUSY"):
+        ControlChannel(Link(*[busy] * 1000), 0.1).read(8, 4)
 
 
 def test_clears_halts() -> None:

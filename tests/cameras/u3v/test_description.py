@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from udccal.cameras.u3v.description import checked_xml, parse_entry, read_description, unpacked
-from udccal.errors import CameraProtocolError
+from udccal.errors import CameraError, CameraProtocolError
 
 SENTENCE = r"Expected .* found .*\. \w+"
 XML = '<?xml version="1.0"?><RegisterDescription><Category Name="Root"/></RegisterDescription>'
@@ -75,6 +75,22 @@ def test_refuses_entries_of_another_length(length: int) -> None:
 def test_reads_plain_and_zipped(stored: bytes, schema: int) -> None:
     memory = manifest((stored, schema, 0), sha1=lambda data: hashlib.sha1(data).digest())
     assert read_description(memory, memory.base) == XML
+
+
+@pytest.mark.parametrize("rest", range(4))
+def test_reads_files_of_any_length_from_devices_that_read_whole_words_alone(rest: int) -> None:
+    stored = XML.encode()
+    stored += b" " * ((rest - len(stored)) % 4)
+    memory = manifest((stored, 0x01010000, 0))
+    memory.content += bytes(4)
+
+    class Words:
+        def read(self, address: int, length: int) -> bytes:
+            if address % 4 or length % 4:
+                raise CameraError("Expected whole words, found others. Ask for those.")
+            return memory.read(address, length)
+
+    assert read_description(Words(), memory.base) == stored.decode()
 
 
 def test_takes_the_newest_device_description() -> None:

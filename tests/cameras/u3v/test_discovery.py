@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import errno
 import sys
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import usb.backend.libusb1
 import usb.core
+import usb.util
 
 from tests.virtual_u3v.backend import VirtualBackend
 from tests.virtual_u3v.camera import VirtualCamera
+from tests.virtual_u3v.descriptors import ConfigurationDescriptor, DeviceDescriptor, InterfaceDescriptor
 from tests.virtual_u3v.faults import Faults
 from tests.virtual_u3v.model import CameraModel, Speed
 from udccal.cameras.protocol import CameraIdentity
@@ -155,3 +159,56 @@ def test_libusb_of_the_wheel_can_be_asked() -> None:
     except CameraError as error:
         pytest.skip(f"no USB on this machine: {error}")
     assert isinstance(seen, tuple)
+
+
+@pytest.fixture
+def second_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each camera's first configuration, of value 2, is that of another kind of device."""
+    of_device, of_configuration = VirtualBackend.get_device_descriptor, VirtualBackend.get_configuration_descriptor
+
+    def device_descriptor(self: VirtualBackend, dev: Any) -> DeviceDescriptor:
+        return replace(of_device(self, dev), bNumConfigurations=2)
+
+    def configuration_descriptor(self: VirtualBackend, dev: Any, config: int) -> ConfigurationDescriptor:
+        camera = of_configuration(self, dev, max(0, config - 1))
+        if config:
+            return camera
+        other = InterfaceDescriptor(0, 0, (), bInterfaceClass=0xFF, bInterfaceSubClass=0)
+        return replace(camera, interfaces=(other,), bConfigurationValue=2)
+
+    monkeypatch.setattr(VirtualBackend, "get_device_descriptor", device_descriptor)
+    monkeypatch.setattr(VirtualBackend, "get_configuration_descriptor", configuration_descriptor)
+
+
+@pytest.mark.usefixtures("second_configuration")
+@pytest.mark.parametrize("active", [0, 1, 2])
+def test_a_camera_in_another_configuration_than_the_first_is_opened_in_it(active: int) -> None:
+    device = VirtualCamera(faults=Faults(unconfigured=True))
+    device._pipe.configuration = active
+    backend = VirtualBackend([device])
+    (seen,) = found_devices(backend)
+    assert (seen.identity.serial, seen.super_speed, seen.trouble) == ("V0000001", True, None)
+    device._pipe.configuration = active
+    with U3vCamera(backend=backend) as camera:
+        assert len(list(camera.frames(1))) == 1
+
+
+def test_a_camera_that_lacks_one_string_keeps_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    get_string = usb.util.get_string
+
+    def without_vendor(device: Any, index: int) -> Any:
+        if index == 1:
+            raise usb.core.USBError("Pipe error", -9, errno.EPIPE)
+        return get_string(device, index)
+
+    def odd_vendor(device: Any, index: int) -> Any:
+        return b"\0".decode("utf-16-le") if index == 1 else get_string(device, index)
+
+    for strings in (without_vendor, odd_vendor):
+        monkeypatch.setattr("usb.util.get_string", strings)
+        backend = VirtualBackend(cameras("A1"))
+        (seen,) = found_devices(backend)
+        assert seen.identity == CameraIdentity("", "Virtual-U3V", "A1", "u3v")
+        assert seen.trouble is None
+        with U3vCamera("A1", backend=backend) as camera:
+            assert camera.identity.vendor == "udccal"

@@ -225,3 +225,11 @@ def test_stops_when_told() -> None:
     source, link = receiver(*sent(0))
     assert source.receive(memoryview(bytearray(source.room)), 1.0, lambda: True) is None
     assert len(link.waiting) == 4
+
+
+@pytest.mark.parametrize("kind", [0x000A, 0x000B])
+def test_payloads_of_another_kind_are_named_whatever_came_last(kind: int) -> None:
+    frames = [part for i in range(16) for part in (leader(i, kind), payload(i), trailer(i))]
+    source, _ = receiver(*frames)
+    with pytest.raises(CameraProtocolError, match=f"found type {kind:#06x}"):
+        taken(source)

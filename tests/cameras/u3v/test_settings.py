@@ -192,3 +192,68 @@ def test_a_colour_sensor_offers_its_mosaic_alone() -> None:
         apply_mode(nodes, Mode("Mono8"))
     choose_known_format(nodes)
     assert registers.uint(16) == 0x01100011
+
+
+def fixed(feature: str) -> str:
+    """A feature whose register can only be read."""
+    return feature.replace("<AccessMode>RW</AccessMode>", "<AccessMode>RO</AccessMode>")
+
+
+@pytest.mark.parametrize("feature", [fixed(number("Gain", 80, 0.0, 0.0)), fixed(size("OffsetX", 96, 0, 0, 1))])
+def test_fixed_features_are_left_as_they_are(feature: str) -> None:
+    nodes, _ = nodes_of(feature)
+    asked = Settings(2e-3, 0.0, Region(0, 0, 64, 40))
+    assert apply_settings(nodes, asked) == asked
+
+
+def test_a_fixed_trigger_and_rate_are_left_as_they_are() -> None:
+    trigger = fixed(enumeration("TriggerMode", 48, Off=0, On=1))
+    rate = fixed(boolean("AcquisitionFrameRateEnable", 24)) + number("AcquisitionFrameRate", 32, 0.5, 60.0)
+    nodes, _ = nodes_of(trigger, rate)
+    assert apply_mode(nodes, Mode("Mono12")) == Mode("Mono12")
+    with pytest.raises(CameraError, match=r"not writable\. Ask"):
+        apply_mode(nodes, Mode("Mono12", 20.0))
+
+
+def test_a_refused_exposure_leaves_the_region_as_it_was() -> None:
+    nodes, _ = nodes_of()
+    before = apply_settings(nodes, Settings(2e-3, 0.0, Region(0, 0, 64, 40)))
+    for exposure_s, gain_dB in ((99.0, 0.0), (2e-3, 9.0)):
+        with pytest.raises(CameraError, match=SENTENCE):
+            apply_settings(nodes, Settings(exposure_s, gain_dB, Region(0, 0, 32, 20)))
+        nodes.refresh()
+        assert read_settings(nodes) == before
+
+
+def test_a_burst_of_one_stands_for_a_frame() -> None:
+    burst = (
+        enumeration("TriggerSelector", 40, FrameBurstStart=0)
+        + enumeration("TriggerMode", 48, Off=0, On=1)
+        + enumeration("TriggerSource", 64, Software=0, Line1=1)
+        + size("AcquisitionBurstFrameCount", 68, 1, 100, 1)
+    )
+    nodes, registers = nodes_of(burst)
+    registers.set_uint(68, 5)
+    assert read_features(nodes).triggers == (Trigger.FREE_RUN, Trigger.SOFTWARE, Trigger.EXTERNAL)
+    assert apply_mode(nodes, Mode("Mono8")) == Mode("Mono8")
+    assert apply_mode(nodes, Mode("Mono8", None, Trigger.SOFTWARE)).trigger is Trigger.SOFTWARE
+    assert (registers.uint(48), registers.uint(68)) == (1, 1)
+
+
+def test_a_camera_without_a_trigger_of_frames_runs_free() -> None:
+    other = (
+        enumeration("TriggerSelector", 40, AcquisitionStart=0)
+        + enumeration("TriggerMode", 48, Off=0, On=1)
+        + enumeration("TriggerSource", 64, Software=0, Line1=1)
+    )
+    nodes, registers = nodes_of(other)
+    registers.set_uint(48, 1)
+    assert read_features(nodes).triggers == (Trigger.FREE_RUN,)
+    assert apply_mode(nodes, Mode("Mono8")) == Mode("Mono8")
+    assert registers.uint(48) == 0
+
+
+def test_chunks_without_a_selector_are_taken_as_they_come() -> None:
+    nodes, registers = nodes_of(boolean("ChunkModeActive", 96))
+    assert enable_chunks(nodes)
+    assert registers.uint(96) == 1

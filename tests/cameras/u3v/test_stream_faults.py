@@ -10,11 +10,15 @@ import pytest
 import usb.core
 
 from tests.cameras.u3v.small_frames import REGION, SENTENCE, check_whole
+from tests.virtual_u3v import manifest
 from tests.virtual_u3v import registers as at
 from tests.virtual_u3v.backend import VirtualBackend
 from tests.virtual_u3v.camera import VirtualCamera
+from tests.virtual_u3v.description import description_of
 from tests.virtual_u3v.descriptors import STREAM_IN
 from tests.virtual_u3v.faults import Faults
+from tests.virtual_u3v.memory import Memory
+from tests.virtual_u3v.model import CameraModel
 from udccal.cameras.protocol import Counts, Mode, Settings, Trigger
 from udccal.cameras.u3v.acquisition import frame_wait_s
 from udccal.cameras.u3v.camera import U3vCamera
@@ -200,3 +204,28 @@ def test_waits_are_bounded_whatever_the_camera_says(
 ) -> None:
     settings, mode = Settings(exposure_s, 0.0, REGION), Mode("BayerRG8", rate_hz, trigger)
     assert frame_wait_s(settings, mode, 2.0) == pytest.approx(wait_s)
+
+
+def test_a_start_that_is_reported_as_running_while_frames_come_is_a_start(
+    device: VirtualCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def description(model: CameraModel) -> str:
+        # As in a camera whose register of the command holds 1 for as long as it takes frames.
+        command = f"<Address>0x{at.ACQUISITION_START.address:08X}</Address><Length>4</Length>"
+        writable = f"{command}<AccessMode>WO"
+        text = description_of(model)
+        assert writable in text
+        return text.replace(writable, f"{command}<AccessMode>RW")
+
+    def read(self: Memory, address: int, length: int) -> bytes:
+        if address == at.ACQUISITION_START.address:
+            return struct.pack("<I", device._acquisition.running)
+        return memory_read(self, address, length)
+
+    memory_read = Memory.read
+    monkeypatch.setattr(manifest, "description_of", description)
+    monkeypatch.setattr(Memory, "read", read)
+    device.unplug()
+    device.plug()
+    with U3vCamera(backend=VirtualBackend([device])) as camera:
+        assert [frame.complete for frame in camera.frames(2)] == [True, True]

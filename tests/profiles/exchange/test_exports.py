@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
@@ -35,6 +36,15 @@ def test_csv_has_every_estimate(tmp_path: Path, profile: Profile) -> None:
     assert [(x["term"], x["name"], float(x["value"]), float(x["sigma"]), x["unit"]) for x in lines] == wanted
 
 
+@pytest.mark.parametrize("words", [{"name": "=1+1"}, {"unit": "@SUM(A1)"}])
+def test_csv_holds_no_formula(tmp_path: Path, profile: Profile, words: dict[str, str]) -> None:
+    first, *others = profile.noise.estimates
+    noise = dataclasses.replace(profile.noise, estimates=(dataclasses.replace(first, **words), *others))
+    with pytest.raises(ProfileError, match="which a spreadsheet would compute"):
+        export_profile(dataclasses.replace(profile, noise=noise), EXPORTS["csv"], tmp_path / "p.csv")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("name", EXPORTS)
 def test_the_covariance_is_beside_and_says_what_is_missing(tmp_path: Path, profile: Profile, name: str) -> None:
     export_profile(profile, EXPORTS[name], tmp_path / "f")
@@ -54,15 +64,16 @@ def test_no_file_is_written_over(tmp_path: Path, profile: Profile, taken: str) -
     assert [item.name for item in tmp_path.iterdir()] == [taken]
 
 
+@pytest.mark.parametrize("end", [OSError(28, "No space left on device"), KeyboardInterrupt("No more")])
 def test_a_file_that_cannot_be_written_leaves_nothing(
-    tmp_path: Path, profile: Profile, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, profile: Profile, monkeypatch: pytest.MonkeyPatch, end: BaseException
 ) -> None:
     def write(path: Path, content: bytes) -> None:
         if path.name == "f":
-            raise OSError(28, "No space left on device")
+            raise end
         path.write_bytes(content)
 
     monkeypatch.setattr("udccal.profiles.exchange.exports.write_atomically", write)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(type(end), match="No "):
         export_profile(profile, EXPORTS["csv"], tmp_path / "f")
     assert list(tmp_path.iterdir()) == []

@@ -92,6 +92,10 @@ BROKEN: dict[str, tuple[tuple[str, str], str]] = {
         ros("cols: 5\n  data: [-0.1, 0.02, 1e-4, -2e-05, 0.]", "cols: 6\n  data: [-0.1, 0.02, 0, 0, 0.1, 0.3]"),
         "further ones are not 0",
     ),
+    "three coefficients": (
+        ros("cols: 5\n  data: [-0.1, 0.02, 1e-4, -2e-05, 0.]", "cols: 3\n  data: [-0.1, 0.02, 1e-4]"),
+        "0, 4, 5, 8, 12, 14 coefficients in .* found 3",
+    ),
     "a name twice": (ros("camera_name:", "image_width:"), "found 'image_width"),
     "a reference": (ros("narrow_stereo", "*anchor"), r"'\*anchor'"),
     "an object to build": (ros("narrow_stereo", "!!python/object/apply:os.system [date]"), "plain YAML"),
@@ -152,3 +156,15 @@ def test_the_whole_models_are_read(tmp_path: Path) -> None:
     for name, text in (("mrcal", MODEL), ("ros-camera-info", CALIBRATOR)):
         (tmp_path / "f").write_text(text)
         assert read_lens(tmp_path / "f", IMPORTS[name]).columns == 96
+
+
+def test_the_mark_that_some_editors_begin_a_text_with_is_passed_over(tmp_path: Path) -> None:
+    for name, text in (("mrcal", MODEL), ("ros-camera-info", CALIBRATOR)):
+        (tmp_path / "f").write_text(text, encoding="utf-8-sig")
+        assert read_lens(tmp_path / "f", IMPORTS[name]).columns == 96
+
+
+def test_a_file_whose_name_is_no_text_can_be_imported(tmp_path: Path, profile: Profile) -> None:
+    made = profile_of(lens_of(profile), profile.rig, "linse\udcff.yaml")
+    write_profile(tmp_path / "p", made)
+    assert "linse?.yaml" in read_profile(tmp_path / "p").geometry.notes[0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.profiles.exchange.conftest import LENS
+from udccal.errors import ProfileError
 from udccal.models.geometry import project
 from udccal.numerics import in_float64
 from udccal.profiles.exchange.exports import EXPORTS, covariance_file, export_profile
@@ -74,6 +75,16 @@ def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(lens.principal_point_px, [46.25, 1 / 3])
     np.testing.assert_array_equal(lens.distortion, [-0.1, 0.02, 1e-4, -2e-5, 0.0])
     assert lens.pose is None
+
+
+@pytest.mark.parametrize(("entry", "fisheye"), [("0", False), ("1", True)])
+def test_the_coefficients_of_a_fisheye_are_not_taken_for_others(file: Path, entry: str, fisheye: bool) -> None:
+    file.write_text(file.read_text().replace("---\n", f"---\nfisheye_model: {entry}\n"))
+    if not fisheye:
+        assert read_lens(file, IMPORTS[FORMAT.name]).columns == 96
+        return
+    with pytest.raises(ProfileError, match="found its fisheye model"):
+        read_lens(file, IMPORTS[FORMAT.name])
 
 
 def test_the_covariance_is_beside_it(file: Path) -> None:

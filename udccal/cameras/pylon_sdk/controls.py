@@ -72,7 +72,11 @@ def read_settings(nodes: Nodes) -> Settings:
 
 def write_settings(nodes: Nodes, settings: Settings) -> None:
     """Set settings that the features allow; a device without a gain in dB is set to its smallest gain."""
-    nodes.set_number(settings.exposure_s * _US_PER_S, *_EXPOSURE)
+    exposure_us = settings.exposure_s * _US_PER_S
+    if (exposures := nodes.bounds(*_EXPOSURE)) is not None:
+        # Conversion to s and back may end an ulp outside.
+        exposure_us = min(max(exposure_us, exposures.low), exposures.high)
+    nodes.set_number(exposure_us, *_EXPOSURE)
     least = nodes.bounds("GainRaw")
     if not nodes.set_number(settings.gain_dB, *_GAIN) and least is not None:
         nodes.set_whole(int(least.low), "GainRaw")

@@ -49,13 +49,14 @@ def read_bootstrap(control: ControlChannel) -> Bootstrap:
         CameraProtocolError: when it has no streaming interface, or the registers are invalid.
         CameraTimeout, CameraLost, CameraError: as for ``ControlChannel.read``.
     """
-    vendor, model, serial = (_text(control, a) for a in (_MANUFACTURER_NAME, _MODEL_NAME, _SERIAL_NUMBER))
     response_ms = _uint32(control, _MAXIMUM_DEVICE_RESPONSE_TIME)
     manifest = _uint64(control, _MANIFEST_TABLE_ADDRESS)
     sbrm = _uint64(control, _SBRM_ADDRESS)
     command_bytes = _uint32(control, sbrm + _MAXIMUM_TRANSFER_LENGTHS)
     acknowledge_bytes = _uint32(control, sbrm + _MAXIMUM_TRANSFER_LENGTHS + 4)
     control.limit(1e-3 * response_ms, command_bytes, acknowledge_bytes)
+    # Texts are longer than the shortest messages.
+    vendor, model, serial = (_text(control, a) for a in (_MANUFACTURER_NAME, _MODEL_NAME, _SERIAL_NUMBER))
     if not _uint64(control, sbrm + _U3VCP_CAPABILITY) & _SIRM_AVAILABLE:
         raise CameraProtocolError(
             f"Expected a camera with a streaming interface, found that {model} {serial} has none. Use another camera."

@@ -31,7 +31,8 @@ def enable_chunks(nodes: NodeMap) -> bool:
         return nodes.has("ChunkModeActive") and nodes.flag("ChunkModeActive")
     nodes.set_flag("ChunkModeActive", True)
     nodes.refresh()
-    for selector in set(_WANTED) & set(nodes.choices("ChunkSelector")):
+    selectors = nodes.choices("ChunkSelector") if nodes.has("ChunkSelector") else ()
+    for selector in set(_WANTED) & set(selectors):
         nodes.choose("ChunkSelector", selector)
         nodes.refresh()
         if nodes.writable("ChunkEnable"):

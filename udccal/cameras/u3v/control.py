@@ -143,8 +143,7 @@ class ControlChannel:
             self._resent += attempt > 0
             wait_s = self._response_s if attempt < _ATTEMPTS - 1 else max(self._response_s, self._timeout_s)
             try:
-                self._link.send(packet, wait_s)
-                acknowledge = self._acknowledge(request_id, expected, what, wait_s)
+                acknowledge = self._answer(packet, request_id, expected, what, wait_s)
             except (CameraTimeout, CameraProtocolError) as error:
                 trouble = error
             except RECOVERABLE as error:
@@ -153,11 +152,18 @@ class ControlChannel:
             else:
                 if acknowledge.status == Status.SUCCESS:
                     return acknowledge
-                trouble = gencp.refusal(acknowledge.status, what)
-                if acknowledge.status != Status.BUSY:
-                    break
-                time.sleep(_BUSY_PAUSE_S)
+                raise gencp.refusal(acknowledge.status, what)
         raise trouble
+
+    def _answer(self, packet: bytes, request_id: int, expected: Command, what: str, wait_s: float) -> Acknowledge:
+        """Send a command, again for as long as the device is busy, up to the time-out; return its acknowledge."""
+        latest = time.monotonic() + self._timeout_s
+        while True:
+            self._link.send(packet, wait_s)
+            acknowledge = self._acknowledge(request_id, expected, what, wait_s)
+            if acknowledge.status != Status.BUSY or time.monotonic() >= latest:
+                return acknowledge
+            time.sleep(_BUSY_PAUSE_S)
 
     def _acknowledge(self, request_id: int, expected: Command, what: str, wait_s: float) -> Acknowledge:
         """Return the acknowledge of a request; skip those of others and those that ask for more time."""

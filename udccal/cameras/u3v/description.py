@@ -15,11 +15,13 @@ from typing import Final, Protocol, final, runtime_checkable
 from xml.parsers import expat
 
 from udccal.cameras.u3v.outline import check_outline, unsound
+from udccal.errors import CameraError
 
 # Files of real cameras have 0.1 to 4 MiB unzipped.
 _MOST_FILE_BYTES: Final = 8 << 20
 _MOST_XML_BYTES: Final = 32 << 20
 _MOST_ENTRIES: Final = 32
+_WORD_BYTES: Final = 4
 
 # An entry of the manifest table (GenICam GenCP): file version, schema word, address, size, SHA-1, reserved.
 _ENTRY: Final = struct.Struct("<IIQQ20s20x")
@@ -86,10 +88,23 @@ def read_description(memory: Memory, manifest_address: int) -> str:
     entry = max(entries, key=lambda e: e.version)
     if not 0 < entry.size <= _MOST_FILE_BYTES:
         raise unsound(f"a description of up to {_MOST_FILE_BYTES} bytes", f"{entry.size}")
-    stored = memory.read(entry.address, entry.size)
+    stored = _read_file(memory, entry.address, entry.size)
     if entry.sha1 is not None and hashlib.sha1(stored, usedforsecurity=False).digest() != entry.sha1:
         raise unsound("a description with the SHA-1 of the manifest", "another")
     return checked_xml(unpacked(stored, entry.file_format))
+
+
+def _read_file(memory: Memory, address: int, size: int) -> bytes:
+    """Read a file of any size; its last bytes as a whole word where the device reads nothing else."""
+    rest = size % _WORD_BYTES
+    stored = memory.read(address, size - rest)
+    if not rest:
+        return stored
+    end = address + size - rest
+    try:
+        return stored + memory.read(end, rest)
+    except CameraError:
+        return stored + memory.read(end, _WORD_BYTES)[:rest]
 
 
 def _read_manifest(memory: Memory, address: int) -> tuple[ManifestEntry, ...]:

@@ -10,7 +10,7 @@ from udccal.cameras.u3v.control import ControlChannel
 from udccal.cameras.u3v.layout import StreamRegisters
 from udccal.cameras.u3v.nodes import NodeMap
 from udccal.cameras.u3v.transport import UsbLink
-from udccal.errors import CameraError
+from udccal.errors import CameraError, CameraTimeout
 
 # A camera may finish the current exposure before it reports that it has stopped.
 _STOP_S: Final = 15.0
@@ -52,7 +52,9 @@ class Device:
         self.registers.enable()
         if self.nodes.writable("TLParamsLocked"):
             self.nodes.set_number("TLParamsLocked", 1)
-        self.nodes.execute("AcquisitionStart")
+        # Some cameras report the command as running for as long as they take frames.
+        with contextlib.suppress(CameraTimeout):
+            self.nodes.execute("AcquisitionStart")
 
     def _stop_acquisition(self) -> None:
         self.nodes.execute("AcquisitionStop", _STOP_S)

@@ -14,7 +14,7 @@ import usb.core
 import usb.util
 
 from udccal.cameras.protocol import CameraIdentity
-from udccal.cameras.u3v.usb_errors import usb_errors
+from udccal.cameras.u3v.usb_errors import EndpointHalted, usb_errors
 from udccal.errors import CameraBusy, CameraError, CameraLost
 
 BACKEND: Final = "u3v"
@@ -46,8 +46,9 @@ class UsbSpeed(enum.IntEnum):
 @final
 @dataclass(frozen=True)
 class UsbInterfaces:
-    """Numbers of the interfaces to claim, and addresses of the endpoints."""
+    """Value of the configuration, numbers of the interfaces to claim in it, and addresses of the endpoints."""
 
+    configuration: int
     numbers: tuple[int, ...]
     control_in: int
     control_out: int
@@ -119,18 +120,20 @@ def find_camera(serial: str | None, backend: Any = None) -> tuple[FoundDevice, U
     raise CameraLost(f"Expected {wanted}, found {seen}. Plug it in and check that it has power.")
 
 
-def configure(device: Any) -> None:
-    """Configure a pyusb device if the system has not; a second configuration would disturb it.
+def configure(device: Any, configuration: int) -> None:
+    """Choose a pyusb device's configuration if it is not chosen; to choose it again would disturb the device.
 
     Raises:
-        usb.core.USBError: when USB fails.
+        usb.core.USBError: when USB fails, or another program uses another configuration of the device.
     """
     try:
-        device.get_active_configuration()
+        active = device.get_active_configuration().bConfigurationValue
     except usb.core.USBError as error:
         if (error.errno, error.backend_error_code) != (None, None):  # pyusb's own error has neither
             raise
-        device.set_configuration()
+        active = None
+    if active != configuration:
+        device.set_configuration(configuration)
 
 
 def _usb_cameras(backend: Any) -> Iterator[UsbCamera]:
@@ -171,7 +174,7 @@ def _interfaces_of(device: Any) -> UsbInterfaces | None:
             inward, outward, streaming = _bulk(control, True), _bulk(control, False), _bulk(stream, True)
             if inward is not None and outward is not None and streaming is not None:
                 numbers = (control.bInterfaceNumber, stream.bInterfaceNumber)
-                return UsbInterfaces(numbers, inward, outward, streaming)
+                return UsbInterfaces(configuration.bConfigurationValue, numbers, inward, outward, streaming)
     return None
 
 
@@ -202,7 +205,8 @@ def _found(camera: UsbCamera) -> FoundDevice:
 
 
 def _device_info(camera: UsbCamera) -> tuple[int, ...] | None:
-    for interface in camera.device[0]:
+    chosen = usb.util.find_descriptor(camera.device, bConfigurationValue=camera.interfaces.configuration)
+    for interface in chosen:
         extra = bytes(interface.extra_descriptors)
         is_control = interface.bInterfaceNumber == camera.interfaces.numbers[0]
         if is_control and len(extra) >= _DEVICE_INFO.size and (extra[1], extra[2]) == _DEVICE_INFO_HEAD:
@@ -216,9 +220,12 @@ def _texts_and_trouble(camera: UsbCamera, indices: tuple[int, ...]) -> tuple[tup
     control = camera.interfaces.numbers[0]
     try:
         with usb_errors("asking the camera for its name"):
-            configure(device)  # opens it, so that a refusal is not taken for a camera without strings
+            # This opens it, so that a refusal is not taken for a camera without strings.
+            configure(device, camera.interfaces.configuration)
             for i, index in enumerate(indices):
-                texts[i] = _text(device, index)
+                # A camera stalls the request of a string that it does not have.
+                with contextlib.suppress(EndpointHalted), usb_errors("asking the camera for its name"):
+                    texts[i] = _text(device, index)
             usb.util.claim_interface(device, control)
             usb.util.release_interface(device, control)
     except CameraError as error:
@@ -234,7 +241,9 @@ def _text(device: Any, index: int) -> str:
         return ""
     try:
         text = usb.util.get_string(device, index) or ""
-    except (ValueError, IndexError, UnicodeDecodeError):
+    except (IndexError, UnicodeDecodeError):
+        return ""
+    except ValueError:
         # pyusb's message for a device without valid string descriptors.
         raise CameraLost("Expected the camera's name, found no readable string. Plug it in again.") from None
     return "".join(c for c in text if c.isprintable()).strip()

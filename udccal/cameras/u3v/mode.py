@@ -14,7 +14,9 @@ from udccal.errors import CameraError, CameraProtocolError
 _RATE: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 _RATE_ENABLE: Final = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
 _RESULTING_RATE: Final = ("ResultingFrameRate", "AcquisitionResultingFrameRate", "ResultingFrameRateAbs")
-_FRAME_START: Final = "FrameStart"
+# Some cameras start each frame as a burst of one.
+_FRAME_START: Final = ("FrameStart", "FrameBurstStart")
+_BURST: Final = "AcquisitionBurstFrameCount"
 _SOFTWARE: Final = "Software"
 _LINE: Final = "Line"
 
@@ -126,6 +128,8 @@ def _set_rate(nodes: NodeMap, rate_hz: float | None) -> None:
 def _triggers(nodes: NodeMap) -> tuple[Trigger, ...]:
     if not nodes.has("TriggerMode") or not nodes.has("TriggerSource"):
         return (Trigger.FREE_RUN,)
+    if nodes.has("TriggerSelector") and _frame_start(nodes) is None:
+        return (Trigger.FREE_RUN,)
     sources = nodes.choices("TriggerSource")
     triggers = [Trigger.FREE_RUN]
     if _SOFTWARE in sources:
@@ -135,9 +139,18 @@ def _triggers(nodes: NodeMap) -> tuple[Trigger, ...]:
     return tuple(triggers)
 
 
+def _frame_start(nodes: NodeMap) -> str | None:
+    """Return the selector's name for the trigger that starts a frame; None when there is none."""
+    selectors = nodes.choices("TriggerSelector")
+    return next((name for name in _FRAME_START if name in selectors), None)
+
+
 def _select_frame_start(nodes: NodeMap) -> None:
-    if nodes.writable("TriggerSelector") and nodes.choice("TriggerSelector") != _FRAME_START:
-        nodes.choose("TriggerSelector", _FRAME_START)
+    if not nodes.writable("TriggerSelector"):
+        return
+    start = _frame_start(nodes)
+    if start is not None and nodes.choice("TriggerSelector") != start:
+        nodes.choose("TriggerSelector", start)
         nodes.refresh()
 
 
@@ -162,6 +175,8 @@ def _set_trigger(nodes: NodeMap, trigger: Trigger) -> None:
     _select_frame_start(nodes)
     nodes.choose("TriggerMode", "Off")
     if trigger is not Trigger.FREE_RUN:
+        if nodes.writable(_BURST):
+            nodes.set_number(_BURST, 1)
         nodes.choose("TriggerSource", _source(nodes, trigger))
         nodes.choose("TriggerMode", "On")
 

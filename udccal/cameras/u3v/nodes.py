@@ -107,12 +107,13 @@ class NodeMap:
             return max(1, int(self._number(name).inc))
 
     def set_number(self, name: str, value: float | int) -> None:
-        """Set a number."""
+        """Set a number; one that the camera has fixed at this value is not written."""
         with self._told(f"set {name} to {value:g}"):
             if not abs(value) < _MOST_INTEGER:
                 raise ValueError("no number that a register holds")
             node = self._number(name)
-            node.value = round(value) if isinstance(node, self._genapi.IInteger) else float(value)
+            if not (self._fixed(node) and float(node.value) == value):
+                node.value = round(value) if isinstance(node, self._genapi.IInteger) else float(value)
 
     def choice(self, name: str) -> str:
         """Return the value of an enumeration."""
@@ -125,9 +126,11 @@ class NodeMap:
             return tuple(str(symbol) for symbol in self._node(name, "IEnumeration").symbolics)
 
     def choose(self, name: str, symbol: str) -> None:
-        """Set an enumeration."""
+        """Set an enumeration; one that the camera has fixed at this value is not written."""
         with self._told(f"set {name} to {symbol}"):
-            self._node(name, "IEnumeration").value = symbol
+            node = self._node(name, "IEnumeration")
+            if not (self._fixed(node) and str(node.value) == symbol):
+                node.value = symbol
 
     def flag(self, name: str) -> bool:
         """Return a boolean."""
@@ -135,9 +138,11 @@ class NodeMap:
             return bool(self._node(name, "IBoolean").value)
 
     def set_flag(self, name: str, value: bool) -> None:
-        """Set a boolean."""
+        """Set a boolean; one that the camera has fixed at this value is not written."""
         with self._told(f"set {name} to {value}"):
-            self._node(name, "IBoolean").value = value
+            node = self._node(name, "IBoolean")
+            if not (self._fixed(node) and bool(node.value) == value):
+                node.value = value
 
     def execute(self, name: str, wait_s: float = _COMMAND_S) -> None:
         """Execute a command, and wait until the camera has finished.
@@ -176,6 +181,9 @@ class NodeMap:
                 return int(self._genapi.EAccessMode.NI)
             return int(self._genapi.EAccessMode.NI) if node is None else int(node.get_access_mode())
 
+    def _fixed(self, node: Any) -> bool:
+        return bool(node.get_access_mode() == self._genapi.EAccessMode.RO)
+
     def _number(self, name: str) -> Any:
         return self._node(name, "IFloat", "IInteger")
 
@@ -196,7 +204,7 @@ class NodeMap:
             yield
         except (self._genapi.GenericException, RuntimeError, TypeError, ValueError, ArithmeticError) as error:
             # GenApi names its own source files after the first colon.
-            reason = " ".join(str(error).split(" : ")[0].split())[:200] or type(error).__name__
+            reason = " ".join(str(error).split(" : ")[0].split()).rstrip(".")[:200] or type(error).__name__
             raise CameraError(
                 f"Expected the camera to {what}, found: {reason}. Ask for something that it can do."
             ) from error

@@ -117,7 +117,7 @@ class Receiver:
     def _leader(self, wait_s: float, stopped: Callable[[], bool]) -> Leader | None:
         """Return the next leader; None when stopped."""
         leader, self._next_leader = self._next_leader, None
-        waited_s, foreign, troubles = 0.0, 0, 0
+        waited_s, foreign, troubles, unusable = 0.0, 0, 0, b""
         latest = time.monotonic() + wait_s + self._timeout_s
         while leader is None and not stopped():
             try:
@@ -136,8 +136,9 @@ class Receiver:
                 packet, troubles = memoryview(b""), troubles + 1
             if leader is None:
                 self._in_step, foreign = False, foreign + len(packet)
+                unusable = bytes(packet) if is_leader(bytes(packet[:4])) else unusable
                 if troubles > _MOST_TROUBLES or foreign > 4 * self.room or time.monotonic() > latest:
-                    raise _no_leader(foreign, troubles, packet)
+                    raise _no_leader(foreign, troubles, unusable)
         self._in_step = True
         return leader
 
@@ -196,10 +197,11 @@ def _leader_in(packet: memoryview) -> Leader | None:
         return None
 
 
-def _no_leader(foreign: int, troubles: int, packet: memoryview) -> CameraProtocolError:
-    if is_leader(bytes(packet[:4])):
+def _no_leader(foreign: int, troubles: int, unusable: bytes) -> CameraProtocolError:
+    """Return why there is no frame: what is wrong with the last leader, where one came."""
+    if unusable:
         try:
-            parse_leader(bytes(packet))
+            parse_leader(unusable)
         except CameraProtocolError as error:
             return error
     return CameraProtocolError(

@@ -64,14 +64,19 @@ def apply_settings(nodes: NodeMap, settings: Settings) -> Settings:
     """Request settings; return the camera's settings afterwards, read back from it.
 
     Raises:
-        CameraError: when one is outside what the camera can do now.
+        CameraError: when one is outside what the camera can do now; nothing is set then.
     """
     _check_region(nodes, settings.region)
+    check_range("a gain", "dB", settings.gain_dB, gain_range(nodes))
+    before = read_region(nodes)
     _set_region(nodes, settings.region)
     # Bounds of the exposure may depend on the region.
     nodes.refresh()
-    check_range("an exposure", "s", settings.exposure_s, exposure_range(nodes))
-    check_range("a gain", "dB", settings.gain_dB, gain_range(nodes))
+    try:
+        check_range("an exposure", "s", settings.exposure_s, exposure_range(nodes))
+    except CameraError:
+        _set_region(nodes, before)
+        raise
     bounds = nodes.bounds(_exposure_name(nodes))
     # Conversion to s and back may end an ulp outside.
     nodes.set_number(_exposure_name(nodes), min(max(settings.exposure_s * _US_PER_S, bounds.low), bounds.high))

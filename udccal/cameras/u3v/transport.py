@@ -30,7 +30,7 @@ class UsbLink:
         self._interfaces: UsbInterfaces = camera.interfaces
         try:
             with self._errors("opening the camera"):
-                configure(self._device)
+                configure(self._device, self._interfaces.configuration)
                 for number in self._interfaces.numbers:
                     self._claim(number)
                 self._stream_in = self._endpoint(self._interfaces.stream_in)

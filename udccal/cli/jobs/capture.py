@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Collection, Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -95,8 +96,16 @@ def refuse_unknown(writer: SessionWriter) -> None:
 
 def _check_captured(session: Session, again: Collection[str], terms: Sequence[TermName]) -> None:
     """Refuse steps that were not captured, or are of terms that are not asked for, before anything else is done."""
+    captured = {step.id: step.term for step in session.manifest.steps}
     for step_id in again:
-        term = session.step(step_id).term
+        term = captured.get(step_id)
+        if term is None:
+            nearest = difflib.get_close_matches(step_id, captured, n=1)
+            meant = f" Did you mean {nearest[0]}?" if nearest else ""
+            raise SessionError(
+                f"Expected the step '{step_id}' in the session {session.path}, found that it was not captured.{meant} "
+                "Steps that are missing are captured without --again."
+            )
         if term not in terms:
             raise SessionError(
                 f"Expected steps of the terms {', '.join(terms)}, found '{step_id}' of {term}. Add --term {term}."

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import final
 
 from udccal.calibration import ORDER, Calibration, Foundation, calibrate
 from udccal.cli.output import Output, StageTime
@@ -85,7 +86,7 @@ def fit_to_profile(
             f"Careful: the {change.what} was exchanged during this session, from {change.before} to {change.after}. "
             "The fits treat all steps as captured with one."
         )
-    with _iterations_to(log):
+    with _iterations_to(output, log):
         calibration = run_fits(output, session) if before is None else run_some(output, session, before, terms)
     calibration = replace(calibration, parent=parent)
     profile_path = profile_path.resolve()
@@ -113,14 +114,24 @@ def fit_to_profile(
     return not calibration.warnings
 
 
+@final
+class _IterationLog(logging.FileHandler):
+    """Notes that a line could not be written, and lets the fits go on: they are worth more than their log."""
+
+    cut_short = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        self.cut_short = True
+
+
 @contextmanager
-def _iterations_to(path: Path | None) -> Iterator[None]:
+def _iterations_to(output: Output, path: Path | None) -> Iterator[None]:
     if path is None:
         yield
         return
     try:
         refuse_links(path.parent, path)
-        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+        handler = _IterationLog(path, mode="w", encoding="utf-8")
     except OSError as error:
         raise UdccalError(
             f"Expected to write the iterations to {path}, found that it cannot be written ({error.strerror}). "
@@ -135,7 +146,12 @@ def _iterations_to(path: Path | None) -> Iterator[None]:
     finally:
         LOG.setLevel(level)
         LOG.removeHandler(handler)
-        handler.close()
+        try:
+            handler.close()
+        except OSError:
+            handler.cut_short = True
+        if handler.cut_short:
+            output.say(f"The iterations in {path} are cut short: it could not be written to.")
 
 
 def run_fits(

@@ -17,7 +17,7 @@ from udccal.reports.tables import Table
 from udccal.rig import RIG_NAME, RigDescription, load_rig
 from udccal.rig_folders import RIG_FILE, find_rig, rig_names, shipped_rig_folder, user_rig_folder
 
-_NAME_LINE = re.compile(r"^name *=.*$", re.MULTILINE)
+_NAME_LINE = re.compile(r"""^[ \t]*(name|"name"|'name')[ \t]*=.*$""", re.MULTILINE)
 
 
 @final

@@ -76,7 +76,7 @@ def export_profile(profile: Profile, to: ExportFormat, path: Path) -> None:
     write_atomically(beside, json.dumps(known, indent=1, allow_nan=False).encode("utf-8") + b"\n")
     try:
         write_atomically(path, content)
-    except OSError:
+    except BaseException:  # Ctrl-C too
         beside.unlink(missing_ok=True)
         raise
 

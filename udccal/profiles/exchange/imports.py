@@ -16,7 +16,7 @@ from udccal.profiles.exchange import mrcal, opencv_yaml, ros_camera_info
 from udccal.profiles.exchange.format import ImportFormat
 from udccal.profiles.exchange.lens import Lens
 from udccal.profiles.profile import Profile, build_profile
-from udccal.profiles.provenance import provenance_now
+from udccal.profiles.provenance import as_text, provenance_now
 from udccal.profiles.ranges import check_term
 from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
@@ -41,7 +41,7 @@ def read_lens(path: Path, of: ImportFormat) -> Lens:
     if len(content) > MOST_BYTES:
         raise ProfileError(f"Expected {path} to hold at most {MOST_BYTES} bytes, found more. It is no camera's file.")
     try:
-        text = content.decode("utf-8")
+        text = content.decode("utf-8-sig")  # some editors begin a text with a mark
     except UnicodeDecodeError as error:
         raise ProfileError(
             f"Expected {path} to be text, found other bytes. Check that it is the right file."
@@ -69,7 +69,7 @@ def profile_of(lens: Lens, rig: RigDescription, source: str) -> Profile:
     geometry = _geometry(lens, nominal_geometry(rig))
     check_term(geometry, "geometry", rig)
     posed = "" if lens.pose is not None else " Its pose behind the panel is the rig description's nominal one."
-    note = f"Imported from {source}, which gives no error bars.{posed}"
+    note = f"Imported from {as_text(source)}, which gives no error bars.{posed}"
     nobody = FitStatus.NOT_CAPTURED
     return build_profile(
         rig,

@@ -17,8 +17,8 @@ from udccal.errors import ProfileError
 from udccal.profiles.profile import Profile
 
 COEFFICIENTS = 5
-# OpenCV's model has at most this many; udccal's has the first five: k1, k2, p1, p2, k3.
-_MOST_COEFFICIENTS = 14
+# OpenCV's model has one of these numbers of coefficients; udccal's has the first five: k1, k2, p1, p2, k3.
+_COUNTS = (0, 4, 5, 8, 12, 14)
 _MOST_PIXELS = 16384
 
 
@@ -84,7 +84,8 @@ def lens_with(
         pose: of the camera.
 
     Raises:
-        ProfileError: when the size cannot be a sensor's, or a coefficient that udccal's model lacks is not 0.
+        ProfileError: when the size cannot be a sensor's, the coefficients are not as many as OpenCV's model has, or one
+            that udccal's model lacks is not 0.
     """
     if not all(1 <= side <= _MOST_PIXELS for side in size):
         raise ProfileError(
@@ -92,10 +93,15 @@ def lens_with(
             "file."
         )
     further = [value for value in coefficients[COEFFICIENTS:] if value != 0]
-    if len(coefficients) > _MOST_COEFFICIENTS or further:
+    if further:
         raise ProfileError(
             f"Expected no distortion beyond k1, k2, p1, p2, k3 in {where}, found {len(coefficients)} coefficients "
             "of which further ones are not 0. Calibrate with five."
+        )
+    if len(coefficients) not in _COUNTS:
+        raise ProfileError(
+            f"Expected {', '.join(map(str, _COUNTS))} coefficients in {where}, as OpenCV's model has, found "
+            f"{len(coefficients)}. Calibrate with five."
         )
     held = np.zeros(COEFFICIENTS)
     held[: len(coefficients)] = coefficients[:COEFFICIENTS]

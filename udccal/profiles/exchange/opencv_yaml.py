@@ -38,10 +38,20 @@ def _matrix(name: str, values: Float[np.ndarray, "rows columns"]) -> str:
 
 def _decode(text: str, where: str) -> Lens:
     document = read_yaml(text, where)
+    _refuse_fisheye(document)
     size = document.whole("image_width"), document.whole("image_height")
     pinhole = pinhole_of(where, document.matrix_of("camera_matrix", 3, 3))
     coefficients = document.matrix("distortion_coefficients").ravel()
     return lens_with(where, size, pinhole, list(coefficients), _pose(document))
+
+
+def _refuse_fisheye(document: Document) -> None:
+    """OpenCV's sample has one name for the coefficients of both of its models, and says which it is in an entry."""
+    if "fisheye_model" in document.entries and document.word("fisheye_model") != "0":
+        raise ProfileError(
+            f"Expected the pinhole model of OpenCV in {document.where}, found its fisheye model. Calibrate with "
+            "the pinhole model."
+        )
 
 
 def _pose(document: Document) -> Pose | None:
