@@ -18,7 +18,7 @@ from udccal.io.hashing import sha256_file
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import AveragedFrames, SingleFrame
 from udccal.sessions.changes import Exchanged
-from udccal.sessions.schema import DarkSubject, FlatSubject, Manifest
+from udccal.sessions.schema import MOST_CHANGES, DarkSubject, FlatSubject, Manifest
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 
@@ -145,6 +145,16 @@ def test_another_rig_camera_or_lens_does_not_go_on_unless_told(tmp_path: Path) -
     by_another_backend = replace(OTHER_CAMERA, backend="other", vendor="MAKER")
     SessionWriter.create_or_resume(tmp_path, with_other_lens(), by_another_backend).close()
     SessionWriter.create_or_resume(tmp_path, with_other_lens(), OTHER_CAMERA).close()
+
+
+def test_no_more_exchanges_are_noted_than_can_be_read(tmp_path: Path) -> None:
+    three_steps(tmp_path)
+    for number in range(MOST_CHANGES):
+        camera = CAMERA if number % 2 else OTHER_CAMERA
+        SessionWriter.create_or_resume(tmp_path, RIG, camera, {Exchanged.CAMERA}).close()
+    with pytest.raises(SessionError, match="Expected at most 100 exchanges .* Begin a new session"):
+        SessionWriter.create_or_resume(tmp_path, RIG, OTHER_CAMERA, {Exchanged.CAMERA})
+    assert len(Session.open(tmp_path).manifest.changes) == MOST_CHANGES
 
 
 def test_a_step_stays_until_the_one_that_replaces_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

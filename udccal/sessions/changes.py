@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from udccal.cameras.protocol import CameraIdentity
 from udccal.errors import SessionError
 from udccal.rig import RigDescription
-from udccal.sessions.schema import Manifest, StoredCamera, StoredChange
+from udccal.sessions.schema import MOST_CHANGES, Manifest, StoredCamera, StoredChange
 
 
 class Exchanged(enum.StrEnum):
@@ -50,7 +50,8 @@ def admit(
         accepted: parts that a person exchanged on purpose.
 
     Raises:
-        SessionError: when the rig differs, or camera or lens differ and that was not accepted.
+        SessionError: when the rig differs, camera or lens differ and that was not accepted, or parts were exchanged
+            too often.
     """
     if rig.model_copy(update={"lens": manifest.rig.lens}) != manifest.rig:
         raise SessionError(
@@ -67,6 +68,10 @@ def admit(
             )
     if not changes:
         return manifest
+    if len(manifest.changes) + len(changes) > MOST_CHANGES:
+        raise SessionError(
+            f"Expected at most {MOST_CHANGES} exchanges in the session {path}, found one more. Begin a new session."
+        )
     update = {"rig": rig, "camera": stored_camera(camera), "changes": (*manifest.changes, *changes)}
     return manifest.model_copy(update=update)
 

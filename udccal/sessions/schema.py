@@ -11,6 +11,8 @@ from udccal.rig import RigDescription
 
 TermName = Literal["noise", "geometry", "wire", "psf", "backscatter"]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+# Exchanges of camera or lens in one session.
+MOST_CHANGES = 100
 RELATIVE_PATH = r"^[A-Za-z0-9_\-]+(/[A-Za-z0-9_\-]+)*\.(png|exr)$"
 RelativePath = Annotated[str, Field(pattern=RELATIVE_PATH, max_length=200)]
 
@@ -117,7 +119,7 @@ class StoredStep(_Strict):
     term: TermName
     subject: Subject
     completed_at: Annotated[str, Field(max_length=40)]
-    after_changes: Annotated[int, Field(ge=0, le=100)] = 0
+    after_changes: Annotated[int, Field(ge=0, le=MOST_CHANGES)] = 0
     captures: Annotated[tuple[StoredCapture, ...], Field(min_length=1, max_length=256)]
 
     @model_validator(mode="after")
@@ -153,7 +155,7 @@ class Manifest(_Strict):
     created_at: Annotated[str, Field(max_length=40)]
     rig: RigDescription
     camera: StoredCamera
-    changes: Annotated[tuple[StoredChange, ...], Field(max_length=100)] = ()
+    changes: Annotated[tuple[StoredChange, ...], Field(max_length=MOST_CHANGES)] = ()
     steps: Annotated[tuple[StoredStep, ...], Field(max_length=20000)] = ()
 
     @model_validator(mode="after")
