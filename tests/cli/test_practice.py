@@ -108,7 +108,8 @@ def undisturbed(rig: Path, folder: Path) -> None:
     with five_terms(rig, folder, "--yes", "--json-events") as plain:
         plain.until('"event": "done"}')
         plain.stop()  # the fits are no part of this test
-    told = [json.loads(line) for line in plain.shown.splitlines() if line.startswith('{"')]
+    *told, last = [json.loads(line) for line in plain.shown.splitlines() if line.startswith('{"')]
+    assert last["error"].startswith("Stopped.")
     assert {event["event"] for event in told} == {"step", "readings", "progress", "verdict", "done"}
     assert told[-1]["complete"]
     readings = [reading for event in told if event["event"] == "readings" for reading in event["readings"]]

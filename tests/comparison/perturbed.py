@@ -65,6 +65,17 @@ def moved(profile: Profile, by_mm: tuple[float, float, float], angles: tuple[flo
     return with_result(profile, "psf", term=replace(profile.psf.term, geometry=geometry))
 
 
+def at_roll(profile: Profile, roll_deg: float) -> Profile:
+    """The profile of a camera that stands on its head."""
+    tilt, _, yaw = angles_deg(np.asarray(profile.geometry.term.rotation_rad))
+    turned = Rotation.from_euler("YXZ", [yaw, -tilt, roll_deg], degrees=True).as_rotvec()
+    geometry = replace(profile.geometry.term, rotation_rad=turned)
+    before = profile.geometry.estimate("roll_deg").value
+    profile = with_estimates(profile, "geometry", {"roll_deg": roll_deg - before})
+    profile = with_result(profile, "geometry", term=geometry)
+    return with_result(profile, "wire", term=replace(profile.wire.term, geometry=geometry))
+
+
 def drawn(profile: Profile, rng: np.random.Generator, terms: tuple[TermName, ...]) -> Profile:
     """The profile with the estimates of some terms drawn anew from their own covariances."""
     for term in terms:

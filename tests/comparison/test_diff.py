@@ -253,3 +253,11 @@ def test_light_in_electrons_is_as_uncertain_as_the_gain(measured: Profile, part:
     light = measured.backscatter.term
     other = with_result(measured, "backscatter", term=replace(light, mask=1.015 * light.mask), captures=None)
     assert udccal.diff(measured, other).terms[4].verdict == verdict
+
+
+@pytest.mark.medium
+def test_profiles_that_tell_no_place_are_not_said_to_share_captures(toy: Profile) -> None:
+    silent = with_result(toy, "geometry", estimates=(), cov=np.zeros((0, 0)))
+    silent = with_result(silent, "noise", estimates=(), cov=np.zeros((0, 0)))
+    found = udccal.diff(silent, silent)
+    assert movement_sentence(found) == "No term of both profiles tells where the camera was."

@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.comparison.perturbed import drawn, with_estimates, with_result
+from tests.comparison.perturbed import at_roll, drawn, with_estimates, with_result
 from udccal.comparison.estimates import ORDER, chi2_of, difference, not_covered
 from udccal.comparison.held import _by_lens, held_estimates
 from udccal.comparison.limits import DiffLimits
@@ -183,3 +183,15 @@ def test_hostile_numbers_are_refused_or_compared(measured: Profile) -> None:
         assert all(np.isfinite(found.of(one).chi2()[0]) and found.of(one).chi2()[0] >= 0 for one in ORDER)
         assert np.isfinite([moved.chi2, moved.agreement_chi2]).all()
     assert 10 < refusals < 60
+
+
+def test_half_a_turn_is_the_same_from_both_sides(measured: Profile) -> None:
+    """180 and -180 degrees are one angle, in differences and in the derivatives behind a covariance."""
+    a, b = (held_estimates(at_roll(measured, roll)) for roll in (179.999, -179.999))
+    found = difference(a, b)
+    for term in ("geometry", "wire"):
+        roll = found.names.index((term, "roll_deg"))
+        assert found.values[roll] == pytest.approx(0.002, abs=1e-6)
+        assert found.sigma[roll] < 0.01
+    beside = held_estimates(at_roll(measured, 179.9))
+    np.testing.assert_allclose(np.diag(a.cov), np.diag(beside.cov), rtol=1e-2)

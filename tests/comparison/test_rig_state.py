@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from tests.comparison.perturbed import drawn, moved, with_estimates, with_result
+from tests.comparison.perturbed import at_roll, drawn, moved, with_estimates, with_result
 from udccal.comparison.combining import combine
 from udccal.comparison.rig_state import NAMES, RigState, rig_state
 from udccal.errors import ProfileError
@@ -139,3 +141,16 @@ def test_combining_is_a_weighted_mean_and_knows_what_it_does_not_know() -> None:
     assert found.cov[0, 0] == pytest.approx(0.2)
     assert (found.chi2, found.dof) == (pytest.approx(0.8), 1)
     assert (found.known.tolist(), bool(np.isnan(found.values[1]))) == ([True, False], True)
+
+
+def test_terms_agree_on_a_camera_that_stands_on_its_head(measured: Profile) -> None:
+    """One term may say 180 degrees and another -180: they are one angle."""
+    mounting = measured.rig.mounting
+    mounting = mounting.model_copy(update={"roll_deg": mounting.roll_deg.model_copy(update={"value": 180.0})})
+    rig = measured.rig.model_copy(update={"mounting": mounting})
+    upright = rig_state(measured)
+    for roll in (179.9995, -179.9995):
+        state = rig_state(replace(at_roll(measured, roll), rig=rig))
+        assert abs(number(state, "roll_deg").value - 180.0) < 0.01
+        assert state.agreement_dof == upright.agreement_dof
+        assert state.agreement_p_value > 0.01

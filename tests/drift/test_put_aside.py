@@ -1,26 +1,60 @@
-"""A check into the folder of an earlier one does not judge the captures of then."""
+"""A check into the folder of an earlier one does not judge the captures of then, nor those that cannot be used."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Never
 
 import pytest
 
-from udccal.cli.jobs.check import _put_aside
+from udccal.cli.bench_options import BenchOptions, CameraKind, DisplayKind
+from udccal.cli.jobs import check as job
+from udccal.cli.output import Output
+from udccal.errors import CaptureError, SessionError
+from udccal.sessions.store import Session
+
+OPTIONS = BenchOptions(CameraKind.sim, None, None, DisplayKind.manual, 0, 0, None)
+
+
+def begun(folder: Path, answered: bool) -> Path:
+    """A folder with the captures of an earlier check."""
+    (folder / "session").mkdir()
+    (folder / "session" / "session.json").write_text("{}")
+    if answered:
+        (folder / "check.json").write_text("{}")
+        (folder / "check.html").write_text("of then")
+    return folder
 
 
 @pytest.mark.parametrize("answered", [True, False])
-def test_captures_of_an_answered_check_are_put_aside(tmp_path: Path, answered: bool) -> None:
-    session, answer, page = tmp_path / "session", tmp_path / "check.json", tmp_path / "check.html"
-    session.mkdir()
-    (session / "session.json").write_text("{}")
-    if answered:
-        answer.write_text("{}")
-        page.write_text("of then")
+def test_captures_of_an_answered_check_are_put_aside(
+    tmp_path: Path, answered: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> Never:
+        raise CaptureError("The lamp is off.")
+
+    monkeypatch.setattr(BenchOptions, "capture", stopped)
+    out = begun(tmp_path, answered)
     for _ in range(2):
-        _put_aside(session, answer, page)
+        with pytest.raises(CaptureError):
+            job.check_profile(Output(), Path("lg55-reduced"), OPTIONS, False, out, None)
         # One that was interrupted goes on, and so does the new one.
-        assert session.exists() is not answered
-        assert (tmp_path / "session-before" / "session.json").exists() is answered
-        assert not answer.exists()
-        assert not page.exists()
+        assert (out / "session").exists() is not answered
+        assert (out / "session-before" / "session.json").exists() is answered
+        assert not (out / "check.json").exists()
+        assert not (out / "check.html").exists()
+
+
+def test_captures_that_cannot_be_used_are_put_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next check captures anew: it would else judge the same captures again, and never end."""
+
+    def refused(*_: object) -> Never:
+        raise SessionError("Expected flats that can be compared, found clipped ones.")
+
+    monkeypatch.setattr(BenchOptions, "capture", lambda *_: True)
+    monkeypatch.setattr(Session, "open", lambda _: None)
+    monkeypatch.setattr(job, "check_rig", refused)
+    out = begun(tmp_path, answered=False)
+    with pytest.raises(SessionError, match="clipped"):
+        job.check_profile(Output(), Path("lg55-reduced"), OPTIONS, False, out, None)
+    assert [item.name for item in out.iterdir()] == ["session-before"]

@@ -84,3 +84,20 @@ def test_an_updated_profile_is_written_and_read(profile: Profile, session: Path,
     assert read.parent == new.parent
     assert "by a check" in read.wire.notes[-1]
     assert replace(read.noise, posterior=None).estimates == profile.noise.estimates
+
+
+def test_what_a_check_changed_is_no_fit_of_the_old_captures(profile: Profile, session: Path) -> None:
+    """A comparison would else say that both profiles were fitted to the same captures, and tell no movement."""
+    assert all(result.captures for result in profile.results)
+    moved = updated(profile, Path("lg55-reduced"), *checked(profile, ("moved",)), session)
+    kept = [one.name for one in moved.results if one.captures]
+    assert kept == ["noise", "geometry"]
+    brighter = updated(profile, Path("lg55-reduced"), *checked(profile, ("gain", "panel level")), session)
+    assert [one.name for one in brighter.results if one.captures] == ["geometry", "wire", "psf"]
+
+
+def test_the_gain_has_the_error_of_the_check(profile: Profile, session: Path) -> None:
+    new = updated(profile, Path("lg55-reduced"), *checked(profile, ("gain",)), session)
+    K = new.noise.estimate("K_DN_per_e")
+    assert K.sigma == pytest.approx(0.001 * float(profile.noise.term.K_DN_per_e))  # 0.1 % in ``checked``
+    assert new.noise.cov[0, 0] == pytest.approx(K.sigma**2)

@@ -91,3 +91,8 @@ def test_a_table_shows_dashes_where_nothing_is_known() -> None:
     table = truth_table(rows)
     assert table.rows[0] == ("noise", "gain", "0.34720", "0.34710", "0.0001", "0.0002", "DN/e")
     assert table.rows[1] == ("wire", "map, RMS", "–", "–", "0.031", "–", "%")
+
+
+def test_half_a_turn_is_the_same_from_both_sides(truth: RigTruth) -> None:
+    roll = next(one for one in true_values(truth) if one.name == "roll_deg")
+    assert replace(roll, value=-179.99).error_of(179.99) == pytest.approx(-0.02)

@@ -49,3 +49,10 @@ def test_a_camera_elsewhere_on_the_panel_fails(true: World, data: BackscatterDat
 def test_a_session_without_white_cannot_be_judged(true: World, data: BackscatterData) -> None:
     none = replace(data, shots=data.shots.part(slice(0, 0)))
     assert failed(judge_backscatter(none, fitted("backscatter", true.term), ValidationLimits())) == {"captures"}
+
+
+def test_pictures_that_are_all_clipped_cannot_be_judged(true: World, data: BackscatterData) -> None:
+    clipped = replace(data, shots=replace(data.shots, clipped=np.ones_like(data.shots.clipped)))
+    found = judge_backscatter(clipped, fitted("backscatter", true.term), ValidationLimits())
+    assert failed(found) == {"captures"}
+    assert "clipped" in found.checks[0].what

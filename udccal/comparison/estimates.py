@@ -33,7 +33,7 @@ class Estimates:
 @final
 @dataclass(frozen=True)
 class Difference:
-    """B less A for the estimates that both hold with a sigma; places on the panel are compared modulo one period.
+    """B less A for the estimates that both hold with a sigma; places are compared modulo one period, angles one turn.
 
     Attributes:
         values: the differences. cov: of these, the sum of both covariances.
@@ -66,6 +66,11 @@ class Difference:
         return chi2_of(self.values, self.cov)
 
 
+def within_half_turn(angles_deg: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return angles less the whole turns that leave them closest to 0."""
+    return np.asarray(angles_deg - 360.0 * np.round(angles_deg / 360.0))
+
+
 def chi2_of(values: Float[np.ndarray, " n"], cov: Float[np.ndarray, "n n"]) -> tuple[float, int]:
     """Return the chi-squared of values whose expectation is 0, and its degrees of freedom: the covariance's rank."""
     if not len(values):
@@ -89,6 +94,7 @@ def difference(a: Estimates, b: Estimates) -> Difference:
     with np.errstate(over="ignore", invalid="ignore"):
         values = b.values[to] - a.values[at]
         wrapped = np.where([unit == "period" for unit in units], values - np.round(values), values)
+        wrapped = np.where([unit == "deg" for unit in units], within_half_turn(values), wrapped)
         cov = a.cov[np.ix_(at, at)] + b.cov[np.ix_(to, to)]
         found = Difference(both, units, a.values[at], b.values[to], wrapped, cov)
         found = found.only(np.diag(cov) > 0)

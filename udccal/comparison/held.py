@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from udccal.calibration import Calibration
 from udccal.comparison.comparable import check_finite
-from udccal.comparison.estimates import ANGLES, ORDER, Estimates, Name
+from udccal.comparison.estimates import ANGLES, ORDER, Estimates, Name, within_half_turn
 from udccal.comparison.grid import sensor_grid
 from udccal.errors import ProfileError
 from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS
@@ -81,7 +81,8 @@ def _with_whole_rotation(found: Estimates, profile: Measured) -> Estimates:
         change[np.ix_(at, np.array(lens))] = _by_lens(profile)
     with np.errstate(all="ignore"):
         values[at[:3]] = _whole_deg(profile, turn)
-        slopes = [(_whole_deg(profile, turn + e) - _whole_deg(profile, turn - e)) / (2 * _POSE_STEP) for e in steps]
+        apart = [within_half_turn(_whole_deg(profile, turn + e) - _whole_deg(profile, turn - e)) for e in steps]
+        slopes = np.array(apart) / (2 * _POSE_STEP)
         change[np.ix_(at[:3], at[:3])] = np.transpose(slopes)
         cov = change @ found.cov @ change.T
     check_finite(values, cov)

@@ -30,7 +30,7 @@ from scipy.linalg import block_diag
 
 from udccal.comparison.combining import Combined, combine
 from udccal.comparison.comparable import check_finite
-from udccal.comparison.estimates import ANGLES, Estimates, Name
+from udccal.comparison.estimates import ANGLES, Estimates, Name, within_half_turn
 from udccal.comparison.held import Measured, held_estimates
 from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.engine.misfit import chi2_tail
@@ -151,6 +151,10 @@ def _measurements(
     for axis, nominal in (("x", mounting.panel_x_px), ("y", mounting.panel_y_px)):
         # Backscatter gives the place against the nominal one.
         values[[name == ("backscatter", f"offset_{axis}_px") for name in names]] -= nominal.value
+    for angle in ANGLES:
+        # 180 and -180 degrees are one angle: the one that is closer to the rig file's counts.
+        here, nominal_deg = [name[1] == angle for name in names], getattr(mounting, angle).value
+        values[here] = nominal_deg + within_half_turn(values[here] - nominal_deg)
     design = np.array([rows[name] for name in names]).reshape(-1, len(NAMES))
     return names, design, values, held.cov[np.ix_(at, at)]
 

@@ -25,7 +25,8 @@ from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
 from udccal.rig import RigDescription
 from udccal.sessions.store import Session
-from udccal.validation.backscatter import SeenLight, brightness
+from udccal.validation.backscatter import SeenLight, brightness, unusable_pictures
+from udccal.validation.flats import NO_PARTS
 
 Verdict = Literal["same", "changed, harmless", "changed"]
 FORMAT, VERSION = "udccal-check", 1
@@ -59,6 +60,11 @@ class RigCheck:
     flat_over_noise: float
     limits: DriftLimits
 
+    @property
+    def explained(self) -> bool:
+        """Whether a pose of the camera explains the flats."""
+        return self.flat_over_noise <= _UNEXPLAINED
+
 
 @final
 @dataclass(frozen=True)
@@ -87,7 +93,8 @@ def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = N
 
     Raises:
         ProfileError: when the session is of another rig or camera, or the profile lacks a term that this needs.
-        SessionError: when steps are missing, flats are clipped or dark, or a file is missing or damaged.
+        SessionError: when steps are missing, flats or panel pictures are clipped or dark, the sensor is too small, or
+            a file is missing or damaged.
     """
     limits = limits or DriftLimits()
     check_same_rig(profile, session.rig, session.camera)
@@ -98,6 +105,8 @@ def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = N
         raise SessionError(f"Expected flats that can be compared, found: {refused[1]} {refused[0].value}")
     gain = gain_ratio(flat, dark, profile.noise, profile.rig.camera.cfa)
     pose = pose_change(profile.wire.term, data)
+    if np.isnan(pose.left).all():
+        raise SessionError(f"Expected flats that can be compared, found: {NO_PARTS}")
     cause = explained(pose.values, pose.cov + _own_cov(profile), limits.chance)
     level = _level(profile, session, cause) / gain.value
     solved = Solved(pose, cause, level, gain.value)
@@ -139,6 +148,8 @@ def _level(profile: Profile, session: Session, cause: Explained) -> Float[np.nda
     term = moved_backscatter(profile.backscatter.term, profile.wire.term, cause.values, np.ones(3))
     shading = profile.wire_map.astype(np.float64)
     data = read_backscatter(session, profile.noise.term, term.geometry, shading)
+    if (why := unusable_pictures(data, term)) is not None:
+        raise SessionError(f"Expected panel pictures that can be compared, found: {why}")
     return brightness(SeenLight.of(data, term, profile.backscatter.diagnostic("model_error_of_white") or 0.0))
 
 

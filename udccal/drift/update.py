@@ -13,6 +13,7 @@ from jaxtyping import Float
 from udccal.comparison.estimates import ANGLES
 from udccal.drift.causes import CAUSES
 from udccal.drift.check import RigCheck, Solved
+from udccal.drift.gain import GainRatio
 from udccal.drift.moved import moved_backscatter, moved_geometry, moved_psf, moved_wire, movement_mm
 from udccal.fitting.geometry.fit import angles_deg
 from udccal.fitting.wire.fit import sensor_map
@@ -36,7 +37,9 @@ def updated(profile: Profile, path: Path, found: RigCheck, solved: Solved, sessi
     significant = {one.name for one in found.changes if one.significant}
     change, wire = solved.cause.values, profile.wire.term
     level = solved.level if "panel level" in significant else np.ones(3)
-    results = _results(profile, solved, level, solved.gain if "gain" in significant else 1.0)
+    gain = next((one for one in found.changes if one.name == "gain" and one.significant), None)
+    ratio = GainRatio(1.0, 0.0) if gain is None else GainRatio(solved.gain, gain.sigma / 100)
+    results = _results(profile, solved, level, ratio)
     moved = bool(significant & set(CAUSES))
     camera, provenance = profile.rig.camera, provenance_now(session / MANIFEST_NAME, profile.provenance.camera)
     new_map = sensor_map(moved_wire(wire, change), camera.rows, camera.columns) if moved else profile.wire_map
@@ -53,7 +56,7 @@ def _sha256(path: Path) -> str:
 
 
 def _results(
-    profile: Profile, solved: Solved, level: Float[np.ndarray, "3"], gain: float
+    profile: Profile, solved: Solved, level: Float[np.ndarray, "3"], gain: GainRatio
 ) -> tuple[FitResult, FitResult, FitResult, FitResult, FitResult]:
     """All terms, those that changed with a note and with other estimates."""
     change, wire = solved.cause.values, profile.wire.term
@@ -69,18 +72,28 @@ def _results(
     shifts = {"standoff_mm": -z, "offset_x_px": -x / pitch, "offset_y_px": -y / pitch}
     moved = bool(change[3:6].any())
     spread = {"standoff_per_pitch": away * sigma[3], "offset_x_periods": sigma[4], "offset_y_periods": sigma[5]}
+    posed, K = bool(change.any()), float(profile.noise.term.K_DN_per_e)
     return (
         _changed(
             profile.noise,
-            replace(profile.noise.term, K_DN_per_e=np.asarray(profile.noise.term.K_DN_per_e) * gain),
-            {"K_DN_per_e": float(profile.noise.term.K_DN_per_e) * (gain - 1)} if gain != 1 else {},
+            replace(profile.noise.term, K_DN_per_e=np.asarray(profile.noise.term.K_DN_per_e) * gain.value),
+            gain.value != 1,
+            {"K_DN_per_e": K * (gain.value - 1)},
+            {"K_DN_per_e": K * gain.sigma},
         ),
-        _changed(profile.geometry, geometry, turned | focal, dict.fromkeys(turned, float(np.rad2deg(sigma[:3].max())))),
-        _changed(profile.wire, moved_wire(wire, change), moves if moved else {}, spread if moved else {}),
-        _changed(profile.psf, moved_psf(profile.psf.term, change), {}),
+        _changed(
+            profile.geometry,
+            geometry,
+            bool(change[:3].any() or change[6]),
+            turned | focal,
+            dict.fromkeys(turned, float(np.rad2deg(sigma[:3].max()))),
+        ),
+        _changed(profile.wire, moved_wire(wire, change), posed, moves if moved else {}, spread if moved else {}),
+        _changed(profile.psf, moved_psf(profile.psf.term, change), posed, {}),
         _changed(
             profile.backscatter,
             moved_backscatter(profile.backscatter.term, wire, change, level),
+            posed or bool((level != 1).any()),
             shifts if moved else {},
         ),
     )
@@ -91,11 +104,18 @@ def _focal(profile: Profile) -> Mapping[str, float]:
 
 
 def _changed(
-    result: FitResult, term: object, added: Mapping[str, float], sigma: Mapping[str, float] | None = None
+    result: FitResult,
+    term: object,
+    changed: bool,
+    added: Mapping[str, float],
+    sigma: Mapping[str, float] | None = None,
 ) -> FitResult:
-    """The result with another term, with numbers added to its estimates, and the sigmas by the check."""
-    if not added:
-        return replace(result, term=term)
+    """The result with another term, with numbers added to its estimates, and the sigmas by the check.
+
+    What changed is no fit of the old captures any more, and does not name them.
+    """
+    if not changed:
+        return result
     sigmas, cov = sigma or {}, result.cov.copy()
     estimates = []
     for index, one in enumerate(result.estimates):
@@ -109,5 +129,5 @@ def _changed(
                 sigma=float(sigmas.get(one.name, one.sigma)),
             )
         )
-    note = f"{', '.join(added)} by a check of a few minutes; the other numbers are older."
-    return replace(result, term=term, estimates=tuple(estimates), cov=cov, notes=(*result.notes, note))
+    notes = (f"{', '.join(added)} by a check of a few minutes; the other numbers are older.",) if added else ()
+    return replace(result, term=term, estimates=tuple(estimates), cov=cov, notes=(*result.notes, *notes), captures=None)

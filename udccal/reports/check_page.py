@@ -42,7 +42,7 @@ def check_page(found: RigCheck, solved: Solved) -> ValidationPage:
         title=f"A check of {found.rig}",
         advice=Advice(headline, mood, (found.advice,)),
         facts=(
-            Fact("changed", ", ".join(found.changed) or "nothing that matters"),
+            Fact("changed", ", ".join(found.changed) or ("nothing that matters" if found.explained else "not known")),
             Fact("flat over noise", f"{found.flat_over_noise:.2f}"),
         ),
         sections=(

@@ -50,6 +50,8 @@ def movement_table(moved: Movement) -> Table:
     return Table("From A to B, against the panel", ("", "moved", "σ", "unit"), rows, frozenset({1, 2}))
 
 
+# Terms that tell where the camera was.
+_TELLING = ("geometry", "wire", "backscatter")
 _PLAIN = {
     "x": "x, to the panel's right",
     "y": "y, down the panel",
@@ -65,7 +67,7 @@ _PLAIN = {
 def movement_sentence(found: ProfileDiff) -> str:
     """Return who tells the movement, whether it is significant, and whether the terms agree on it."""
     moved = found.movement
-    if not moved.terms and all(one.same_captures for one in found.terms if one.dof):
+    if not moved.terms and any(one.same_captures and one.dof for one in found.terms if one.term in _TELLING):
         return "Both profiles were fitted to the same captures: they tell no movement."
     if not moved.terms:
         return "No term of both profiles tells where the camera was."

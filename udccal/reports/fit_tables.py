@@ -48,7 +48,10 @@ def captures_sentence(result: FitResult) -> str:
         return ""
     used = result.captures
     if used is None:
-        return f"What the {result.name} fit used and left out is not known: older profiles do not say so."
+        return (
+            f"What the {result.name} fit used and left out is not known: older profiles, and those that a check has "
+            "updated, do not say so."
+        )
     gains = " to ".join(dict.fromkeys(f"{gain:g}" for gain in used.gain_dB))
     times = " to ".join(dict.fromkeys(used.completed_at))
     effort = "" if result.effort in ("full", None) else f" Its effort was {result.effort}: a full fit may be better."

@@ -60,7 +60,9 @@ def _geometry(truth: RigTruth) -> tuple[TrueValue, ...]:
     yaw, tilt, roll = Rotation.from_matrix(optics.R_panel_camera).as_euler("YXZ", degrees=True)
     lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), optics.distortion, strict=True))
     frame = {"fx": optics.fx_px, "fy": optics.fy_px, "cx": optics.cx_px, "cy": optics.cy_px}
-    return _of("geometry", frame | lens | {"tilt_deg": -tilt, "roll_deg": roll, "yaw_deg": yaw})
+    angles = {"tilt_deg": -tilt, "roll_deg": roll, "yaw_deg": yaw}
+    turned = (TrueValue("geometry", name, float(value), 360.0) for name, value in angles.items())
+    return (*_of("geometry", frame | lens), *turned)
 
 
 def _wire(truth: RigTruth) -> tuple[TrueValue, ...]:

@@ -38,10 +38,8 @@ def validate_backscatter(profile: Profile, session: Session, limits: ValidationL
 @in_float64
 def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], limits: ValidationLimits) -> Judged:
     """Judge the panel's brightness, the light of its pictures, and the scatter of the bins."""
-    if not len(data.shots.rate):
-        return unusable("backscatter", "The white picture or the dark frame is missing. Capture the backscatter steps.")
-    if data.shots.rate.shape[1:] != np.shape(result.term.mask):
-        return unusable("backscatter", "The profile's grid is not that of this session's rig. Calibrate the rig again.")
+    if (why := unusable_pictures(data, result.term)) is not None:
+        return unusable("backscatter", why)
     seen = SeenLight.of(data, result.term, result.diagnostic("model_error_of_white") or 0.0)
     worst = int(np.argmax(np.abs(seen.z).mean(axis=(1, 2))))
     count = int(seen.usable.sum())
@@ -61,6 +59,17 @@ def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], lim
     name = ("the white picture", *data.names)[worst]
     caption = f"The panel's light in {name}, seen less predicted, green, in sigma."
     return Judged(checks, ZMap(seen.z[worst, 1].reshape(seen.shape), "x", "y", caption))
+
+
+def unusable_pictures(data: BackscatterData, term: Backscatter) -> str | None:
+    """Return why a session's panel pictures cannot be predicted; None where they can be."""
+    if not len(data.shots.rate):
+        return "The white picture or the dark frame is missing. Capture the backscatter steps."
+    if data.shots.rate.shape[1:] != np.shape(term.mask):
+        return "The profile's grid is not that of this session's rig. Calibrate the rig again."
+    if not data.shots.usable[:-1, :, ::_EVERY, ::_EVERY].any():
+        return "All of the panel's pictures are clipped. Capture the backscatter steps again with shorter exposures."
+    return None
 
 
 @final

@@ -43,6 +43,9 @@ def compare_noise(a: Session, b: Session, limits: ValidationLimits) -> Judged:
     if one is None or other is None:
         return unusable("noise", "One of the sessions lacks pairs of dark and bright frames. Capture them.")
     (first, first_sigma), (second, second_sigma) = (_gain(seen) for seen in (one, other))
+    if min(first, second) <= 0:
+        why = "The flats of one of the sessions tell no gain: they are clipped, or too few of them differ in light."
+        return unusable("noise", f"{why} Capture flats at several exposures, none of them clipped.")
     off, chance = 100 * abs(second / first - 1), 100 * float(np.hypot(first_sigma, second_sigma)) * _sigmas(limits)
     gain = at_most(
         "noise",
@@ -130,12 +133,14 @@ def compare_flats(a: Session, b: Session, limits: ValidationLimits) -> Judged:
         return unusable("wire", "One of the flats is not brighter than its dark frame. Capture it again.")
     ratio = other.signal / np.maximum(one.signal, 1e-9)
     sigma = np.abs(ratio) * np.sqrt(sum(flat.variance / np.maximum(flat.signal, 1e-9) ** 2 for flat in (one, other)))
-    used, light = one.signal > 0, np.ones(len(ratio))
+    # Stuck pixels have no signal, and no sigma.
+    lit, sigma = (one.signal > 0) & (other.signal > 0), np.maximum(sigma, 1e-9)
+    used, light = lit, np.ones(len(ratio))
     design = light_design(scaled, site)
     for _ in range(2):  # Single defects are known once the light is.
         root = used / sigma
         light = design @ np.linalg.lstsq(design * root[:, None], ratio * root, rcond=None)[0]
-        used = (one.signal > 0) & (np.abs(ratio - light) < np.maximum(_DEFECT * sigma, 0.3 * light))
+        used = lit & (np.abs(ratio - light) < np.maximum(_DEFECT * sigma, 0.3 * light))
     off, variance, dof = (ratio / light - 1)[used], ((sigma / light) ** 2)[used], float(used.sum() - design.shape[1])
     cells, cell_sigma = part_medians(off, variance, scaled[used])
     if np.isnan(cells).all():

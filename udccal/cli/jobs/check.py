@@ -11,10 +11,12 @@ from udccal.cli.jobs.capture import Wanted
 from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
-from udccal.drift.check import check_measured, check_rig, short_rig
+from udccal.drift.check import RigCheck, Solved, check_measured, check_rig, short_rig
 from udccal.drift.update import updated
+from udccal.errors import SessionError
 from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import check_writable, storing_in
+from udccal.profiles.profile import Profile
 from udccal.profiles.store import check_replaceable, load_profile, write_profile
 from udccal.reports.check_page import changes_table, check_page
 from udccal.reports.page import write_page
@@ -34,7 +36,7 @@ def check_profile(
         options: where the rig is.
         agree: whether a capture that a person is led through goes on by itself wherever all is in order.
         out: folder for ``session``, ``check.json`` and ``check.html``.
-        update: path of a new profile with what changed; None for none.
+        update: path of a new profile with what changed, written where a pose explains the flats; None for none.
 
     Raises:
         ProfileError: when the profile cannot be read, lacks a term that this needs, or is not of this rig and camera;
@@ -52,16 +54,22 @@ def check_profile(
     check_measured(profile)
     rig, folder = short_rig(profile.rig), out / "session"
     with storing_in(out):
-        _put_aside(folder, out / "check.json", out / "check.html")
+        if (out / "check.json").exists():
+            _put_aside(folder)
+        # They would else stay beside captures that they do not tell of.
+        for file in (out / "check.html", out / "check.json"):
+            file.unlink(missing_ok=True)
     wanted = Wanted(folder, ("wire", "backscatter"), like=profile)
     person = TerminalPerson(output) if options.real else None
     if not options.capture(output, rig, wanted, person, agree):
         return None
     with output.stage("comparing"):
-        found, solved = check_rig(profile, Session.open(folder))
+        found, solved = _compared(profile, folder, out)
     output.answer(found.advice)
     output.table(changes_table(found))
-    if update is not None:
+    if update is not None and not found.explained:
+        output.say(f"No updated profile at {update}: no movement of the camera explains the flats.")
+    elif update is not None:
         with storing_in(update.parent):
             write_profile(update, updated(profile, path, found, solved, folder))
         output.say(f"Updated profile: {update}")
@@ -73,14 +81,19 @@ def check_profile(
     return found.verdict != "changed"
 
 
-def _put_aside(session: Path, answer: Path, page: Path) -> None:
-    """Keep the captures of a check that was answered as ``session-before``: a rig of today is not judged by them.
+def _compared(profile: Profile, session: Path, out: Path) -> tuple[RigCheck, Solved]:
+    """Compare; captures that cannot be used are put aside, so that the next check does not go on with them."""
+    try:
+        return check_rig(profile, Session.open(session))
+    except SessionError:
+        with storing_in(out):
+            _put_aside(session)
+        raise
 
-    The answer goes with its page, which would else stay beside captures that it does not tell of.
-    """
-    if answer.exists() and session.is_dir():
+
+def _put_aside(session: Path) -> None:
+    """Keep captures as ``session-before``: a rig of today is not judged by them."""
+    if session.is_dir():
         before = session.with_name("session-before")
         shutil.rmtree(before, ignore_errors=True)
         session.rename(before)
-    for file in (page, answer):
-        file.unlink(missing_ok=True)
