@@ -109,7 +109,7 @@ def undisturbed(rig: Path, folder: Path) -> None:
         plain.until('"event": "done"}')
         plain.stop()  # the fits are no part of this test
     # After the last event, it may be read already that the program was stopped.
-    told = [json.loads(line) for line in plain.shown.splitlines() if line.startswith('{"event"')]
+    told = [json.loads(line) for line in plain.shown.splitlines() if line.startswith('{"') and '"event"' in line]
     assert {event["event"] for event in told} == {"step", "readings", "progress", "verdict", "done"}
     assert told[-1]["complete"]
     readings = [reading for event in told if event["event"] == "readings" for reading in event["readings"]]
