@@ -57,7 +57,7 @@ def test_a_profile_without_the_terms_is_refused_before_it_captures(tmp_path: Pat
     command = [sys.executable, "-m", "udccal.cli.main", "check", "--profile", str(tmp_path / "lacking")]
     done = subprocess.run([*command, "--out", str(tmp_path / "out")], capture_output=True, text=True, timeout=280)
     assert done.returncode == 1
-    assert "none of wire" in done.stderr
+    assert "found no wire" in done.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -87,7 +88,10 @@ def test_a_signal_ends_it_and_removes_the_shared_memory(
     raw_files = write_raw_files(tmp_path / "raw", 300)
     source = ["--camera", "files", "--files", raw_files, "--exposure-s", "0.001", "--fps", "5"]
     words = command("--profile", profile_folder, "--sink", f"shm:{name}", *source)
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
+    pipe = subprocess.PIPE
+    # A shell has programs that it runs in the background ignore Ctrl-C, and all that these start.
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, cwd=ROOT, preexec_fn=heed) as running:
         deadline = time.monotonic() + 200
         while not Path("/dev/shm", name).exists() and running.poll() is None and time.monotonic() < deadline:
             time.sleep(0.05)
