@@ -1,5 +1,10 @@
 """The errors of udccal. Each message says what was expected, what was found, and what to do."""
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
 
 class UdccalError(Exception):
     """Root of every error that udccal raises on purpose."""
@@ -73,3 +78,9 @@ def found_instead(value: object) -> str:
     """What an argument is that should have been an array, for a message: type and shape."""
     kind, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     return type(value).__name__ if kind is None else f"{kind} of shape {shape}"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a sentence for a message, after a blank, that asks for the most similar known name; empty without one."""
+    nearest = difflib.get_close_matches(name, list(known), n=1)
+    return f" Did you mean {nearest[0]}?" if nearest else ""

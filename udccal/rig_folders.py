@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from importlib import resources
 from pathlib import Path
 from typing import Final
 
-from udccal.errors import RigError
+from udccal.errors import RigError, did_you_mean
 
 RIG_FILE: Final = "rig.toml"
 # Own rigs that a message names.
@@ -46,8 +45,7 @@ def find_rig(name_or_path: str | Path) -> Path:
         if (place / RIG_FILE).is_file():
             return place
     own, shipped = rig_names(user_rig_folder()), rig_names(shipped_rig_folder())
-    nearest = difflib.get_close_matches(path.name, {*own, *shipped}, n=1)
-    meant = f" Did you mean {nearest[0]}?" if nearest else ""
+    meant = did_you_mean(path.name, {*own, *shipped})
     yours = f"one of your own ({', '.join(own[:_MOST_NAMED])}), " if own else ""
     raise RigError(
         f"Expected a rig folder with a {RIG_FILE}, found none for '{name_or_path}'.{meant} Give a path, {yours}or one "

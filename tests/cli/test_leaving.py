@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.ctrl_c import heeding_ctrl_c
 from tests.toy_rigs import write_toy_rig
 from udccal.errors import UdccalError
 from udccal.io.out_folder import check_writable
@@ -24,11 +25,6 @@ PORTRAIT = Path(__file__).resolve().parents[2] / "udccal" / "data" / "portrait.j
 
 def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, timeout=280)
-
-
-def heeding_ctrl_c() -> None:
-    """In a new process: a shell that runs these tests in the background has them ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def interrupted(words: list[str | Path], sign: Path | None, wait_s: float) -> tuple[int, str, str]:

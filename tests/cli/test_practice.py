@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.ctrl_c import heeding_ctrl_c
 from tests.toy_rigs import change_rig, write_five_term_rig, write_toy_rig
 from udccal.benches.capture import TERMS
 from udccal.sessions.schema import LedSubject
@@ -55,7 +56,7 @@ class Terminal:
             stdout=theirs,
             stderr=theirs,
             start_new_session=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+            preexec_fn=heeding_ctrl_c,
         )
         os.close(theirs)
         os.set_blocking(self._keys, False)

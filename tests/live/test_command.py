@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,6 +19,7 @@ import numpy as np
 import pytest
 
 from examples.read_live import frames
+from tests.ctrl_c import heeding_ctrl_c
 from tests.live.conftest import COLUMNS, ROWS
 from tests.live.test_live_cameras import plug
 from tests.virtual_u3v.faults import Faults
@@ -89,9 +89,7 @@ def test_a_signal_ends_it_and_removes_the_shared_memory(
     source = ["--camera", "files", "--files", raw_files, "--exposure-s", "0.001", "--fps", "5"]
     words = command("--profile", profile_folder, "--sink", f"shm:{name}", *source)
     pipe = subprocess.PIPE
-    # A shell has programs that it runs in the background ignore Ctrl-C, and all that these start.
-    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
-    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, cwd=ROOT, preexec_fn=heed) as running:
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, cwd=ROOT, preexec_fn=heeding_ctrl_c) as running:
         deadline = time.monotonic() + 200
         while not Path("/dev/shm", name).exists() and running.poll() is None and time.monotonic() < deadline:
             time.sleep(0.05)

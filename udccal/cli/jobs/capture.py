@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Collection, Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from udccal.benches.bench import CaptureBench
 from udccal.benches.capture import TERMS, capture_term
 from udccal.cli.output import Output
 from udccal.comparison.comparable import check_same_rig
-from udccal.errors import SessionError
+from udccal.errors import SessionError, did_you_mean
 from udccal.profiles.profile import Profile
 from udccal.sessions.changes import Exchanged, stored_camera
 from udccal.sessions.schema import TermName
@@ -100,8 +99,7 @@ def _check_captured(session: Session, again: Collection[str], terms: Sequence[Te
     for step_id in again:
         term = captured.get(step_id)
         if term is None:
-            nearest = difflib.get_close_matches(step_id, captured, n=1)
-            meant = f" Did you mean {nearest[0]}?" if nearest else ""
+            meant = did_you_mean(step_id, captured)
             raise SessionError(
                 f"Expected the step '{step_id}' in the session {session.path}, found that it was not captured.{meant} "
                 "Steps that are missing are captured without --again."
