@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 from scipy.ndimage import map_coordinates
+from scipy.optimize import least_squares
 
 from udccal.comparison.comparable import check_finite
 from udccal.comparison.grid import kernel_places, light_step, sensor_grid
-from udccal.comparison.held import STEPS
+from udccal.comparison.shared import STEPS
 from udccal.fitting.geometry.fit import angles_deg, term_at
 from udccal.kernels import fitted_size, kernels_at
 from udccal.models.backscatter import Backscatter, PanelResponse, grid_positions, panel_response, response_grid
@@ -90,13 +91,35 @@ def _rays(
     slopes = [_slopes(term, seen, image) for term, seen in ((one, seen_a), (other, seen_b))]
     turns = (0.5 * (slopes[0] + slopes[1]))[:, :, -3:].reshape(-1, 3)
     check_finite(rays, turns)
-    lens = rays - (turns @ np.linalg.lstsq(turns, rays.ravel(), rcond=None)[0]).reshape(-1, 2)
+    lens = _without_turn(rays, turns.reshape(-1, 2, 3), _angles_per_px(one, pixels))
     if not (_of_lens_and_pose(a.geometry) and _of_lens_and_pose(b.geometry)):
         return rays, lens, None
     variance = sum(
         np.einsum("nip,pq,niq->n", s, r.cov, s) for s, r in zip(slopes, (a.geometry, b.geometry), strict=True)
     )
     return rays, lens, np.sqrt(np.maximum(variance, 0.0) / 2)
+
+
+def _angles_per_px(term: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3 2"]:
+    """By how much a direction turns, as a vector in rad, from a pixel to the next across and down."""
+    see, half = jax.jit(panel_directions), 0.5 * np.eye(2)
+    return np.stack([np.asarray(see(term, pixels + e)) - np.asarray(see(term, pixels - e)) for e in half], axis=-1)
+
+
+def _without_turn(
+    rays: Float[np.ndarray, "n 2"], turns: Float[np.ndarray, "n 2 3"], angles_per_px: Float[np.ndarray, "n 3 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """The rays' differences after the turn that leaves the least sum of fourth powers of angles, which mrcal takes."""
+    unit = np.sqrt((rays**2).mean()) or 1.0
+    seen, by_turn = angles_per_px @ (rays / unit)[..., None], angles_per_px @ turns
+    # Angles in pixels of the picture's middle, of about 1.
+    scale = np.sqrt(len(seen) / (angles_per_px**2).sum())
+
+    def squares(turn: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
+        return np.asarray(((scale * (seen[..., 0] - by_turn @ turn)) ** 2).sum(axis=-1))
+
+    start = np.linalg.lstsq(turns.reshape(-1, 3), rays.ravel() / unit, rcond=None)[0]
+    return rays - unit * (turns @ least_squares(squares, start, x_scale="jac").x)
 
 
 def _of_lens_and_pose(result: FitResult[Geometry]) -> bool:

@@ -31,7 +31,8 @@ from scipy.linalg import block_diag
 from udccal.comparison.combining import Combined, combine
 from udccal.comparison.comparable import check_finite
 from udccal.comparison.estimates import ANGLES, Estimates, Name, within_half_turn
-from udccal.comparison.held import Measured, held_estimates
+from udccal.comparison.held import held_estimates
+from udccal.comparison.shared import Measured
 from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.engine.misfit import chi2_tail
 from udccal.quantities import quantity
