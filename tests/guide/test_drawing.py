@@ -5,6 +5,7 @@ from xml.etree import ElementTree
 import pytest
 
 from udccal.arrangements import Arrangement, Dark, FlatLight, Led
+from udccal.drift.check import short_rig
 from udccal.guide.capture import expected_seconds, guided_steps
 from udccal.guide.drawing import side_view
 from udccal.rig import load_rig
@@ -44,3 +45,10 @@ def test_every_step_has_its_time() -> None:
     assert len(seconds) == len(steps) == 4
     assert seconds[0] == pytest.approx(45 + 300 / 120, abs=0.1)
     assert all(each > 8 * 6 for each in seconds[2:])
+
+
+def test_a_check_takes_three_minutes() -> None:
+    seconds = expected_seconds(rig := short_rig(RIG), guided_steps(rig, ["wire", "backscatter"]))
+    assert len(seconds) == 3
+    assert 45 * 3 < sum(seconds) < 180
+    assert sum(expected_seconds(RIG, guided_steps(RIG, ["wire", "geometry"]))) > 180
