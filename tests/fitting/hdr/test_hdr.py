@@ -199,6 +199,23 @@ def test_a_wrong_noise_model_is_told_by_the_scatter() -> None:
             assert "Check K" in wrong.notes[-1]
 
 
+@pytest.mark.parametrize(
+    ("K", "sigma_d_e", "bits"), [(0.05, 4.0, 12), (20.0, 4.0, 16), (0.36, 0.0, 12), (0.02, 4.0, 8)]
+)
+def test_codes_far_from_the_noise_are_no_doubt(K: float, sigma_d_e: float, bits: int) -> None:
+    """Dark samples that rounding moves alike, or that code 0 cuts off, scatter less than their noise."""
+    black, top, times = 64.0 if bits > 8 else 8.0, 2**bits - 1, 1e-4 * 4.0 ** np.arange(8)
+    noise = replace(NOISE, K_DN_per_e=K, black_DN=black, saturation_DN=float(top), sigma_d_e=sigma_d_e)
+    rng, rate = np.random.default_rng(8), np.geomspace(1e1, 1e7, 8000)
+    light = rng.poisson((rate + 20.0) * times[:, None]) + sigma_d_e * rng.standard_normal((8, 8000))
+    frames = np.clip(np.rint(black + K * light), 0, top).astype(np.uint16)
+    merged = merge_bracket(frames, times, noise)
+    assert merged.status is FitStatus.CONVERGED, merged.notes
+    wrong = merge_bracket(frames, times, replace(noise, K_DN_per_e=1.2 * K))
+    assert wrong.status is FitStatus.POOR_FIT
+    assert "Check K" in " ".join(wrong.notes)
+
+
 @pytest.mark.parametrize("exposures", [EXPOSURES, np.repeat(EXPOSURES[-1:], 5)], ids=["bracket", "repeats"])
 def test_offsets_of_pixels_are_in_sigma_and_no_doubt(exposures: np.ndarray) -> None:
     offsets_e = 4.0 * np.random.default_rng(61).standard_normal((120, 120))

@@ -65,7 +65,11 @@ class HdrRules:
 
 
 class SensorNumbers(eqx.Module):
-    """The numbers of the noise model, in electrons, single precision; ``rounding_e`` shifts dark samples at most."""
+    """The numbers of the noise model, in electrons, single precision.
+
+    ``rounding_e`` shifts dark samples at most. Below ``rounded_below_e`` it moves samples of a pixel alike; that is 0
+    where noise smears the codes' steps.
+    """
 
     black_DN: Float[Arrayish, ""]
     e_per_DN: Float[Arrayish, ""]
@@ -74,6 +78,7 @@ class SensorNumbers(eqx.Module):
     level_e: Float[Arrayish, ""]
     offset_e: Float[Arrayish, ""]
     rounding_e: Float[Arrayish, ""]
+    rounded_below_e: Float[Arrayish, ""]
     bend_per_DN: Float[Arrayish, ""]
 
     @classmethod
@@ -92,10 +97,11 @@ class SensorNumbers(eqx.Module):
         # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
         floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
         # The first harmonic of the codes' steps, as far as noise does not smear them.
-        rounding = q / K / np.pi * np.exp(-2 * (np.pi * sigma_d * K / q) ** 2)
+        rounding = float(q / K / np.pi * np.exp(-2 * (np.pi * sigma_d * K / q) ** 2))
+        below = rules.least_codes * q / K if rounding > rules.black_off * floor**0.5 else 0.0
         bend = float(np.asarray(noise.bend_per_DN))
         level = linear_signal(saturation - black, bend) / K - rules.margin_sigma * floor**0.5
-        return cls(black, 1 / K, dark * unit_s, floor, level, offset, float(rounding), bend)
+        return cls(black, 1 / K, dark * unit_s, floor, level, offset, rounding, below, bend)
 
     def electrons(self, codes: Float[Arrayish, "n pixels"]) -> Float[Arrayish, "n pixels"]:
         """Light of samples in e-, dark current included; the response's bend is taken out."""

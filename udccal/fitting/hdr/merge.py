@@ -95,9 +95,8 @@ def merge_bracket(
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
     notes += doubts
     rounded_below = 0.0
-    if sensor.rounding_e > rules.black_off * math.sqrt(sensor.floor_e2):
-        longest = float(times[~bracket.dropped[:, 0]].max())
-        rounded_below = rules.least_codes * float(noise.q_DN) * float(sensor.e_per_DN) / longest
+    if sensor.rounded_below_e > 0:
+        rounded_below = float(sensor.rounded_below_e) / float(times[~bracket.dropped[:, 0]].max())
         notes.append("Dark noise is far below a code: rounding moves dark pixels by up to half a code. Raise the gain.")
     off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
     hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
@@ -249,7 +248,10 @@ class _Bracket:
     def doubts(self, merged: BlockMerge, unlike: Int[np.ndarray, " off"]) -> Iterator[str]:
         """Sentences for samples that contradict the noise model, or one another."""
         scatter, black_DN = self._scatter(merged), self._black_off(merged) / self.sensor.e_per_DN
-        if scatter != 1:
+        # Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
+        scores = self._frame_scores(merged, 2, 3.0)
+        differs = scores.max() > self.rules.frame_sigma * max(scatter, 1.0) ** 0.5 and not black_DN
+        if scatter != 1 and not differs:
             yield (
                 f"Samples scatter about a pixel's light with {scatter:.2f} times the variance of the noise model. "
                 "Check K, black level and exposure times; rate and sigma are not to be trusted."
@@ -261,15 +263,11 @@ class _Bracket:
             )
         advice = "Check their exposure times, or take exposures that lie closer together."
         if unlike.size:
-            differ = f"frames {' and '.join(map(str, unlike))} differs, and no other frame tells which one is right"
-            yield f"The light of {differ}: frame {unlike[0]} is left out. {advice}"
-        elif scatter == 1 and not black_DN:
-            # Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
-            scores = self._frame_scores(merged, 2, 3.0)
-            if scores.max() > self.rules.frame_sigma:
-                differs = f"frame {scores.argmax()} differs from that of the frames beside it"
-                few = "too few pixels have a third sample that tells which one is right"
-                yield f"The light of {differs}, and {few}. {advice}"
+            frames = f"frames {' and '.join(map(str, unlike))} differs, and no other frame tells which one is right"
+            yield f"The light of {frames}: frame {unlike[0]} is left out. {advice}"
+        elif differs:
+            few = "too few pixels have a third sample that tells which one is right"
+            yield f"The light of frame {scores.argmax()} differs from that of the frames beside it, and {few}. {advice}"
 
     def _scatter(self, merged: BlockMerge) -> float:
         """Variance of samples about their pixel's light over the model's; 1 where that is what chance gives."""
@@ -278,6 +276,9 @@ class _Bracket:
         # is, changes nothing then.
         known = 1 / np.maximum((seen.weight * seen.times**2).sum(axis=0), 1e-30)
         clear = seen.clear & (seen.signal**2 > self.rules.sure_electrons * known * seen.times**2)
+        # Samples that rounding moves alike, or that code 0 cuts off, scatter less.
+        zero_e = self.sensor.electrons(np.zeros((1, 1)))
+        clear &= (seen.mean >= self.sensor.rounded_below_e) & (seen.mean - 5 * np.sqrt(seen.variance) > zero_e)
         # Hits in pixels of two samples are not found: a few of them must not count much.
         chi2 = np.minimum(seen.errors**2 / seen.variance, 4.0**2)
         # A pixel's offset moves its samples by what its light does not follow.
