@@ -105,9 +105,16 @@ def run_step(
         writer: gets the step.
         start_s: first guess of an exposure that is metered.
         steps: those of the procedure: where the step was captured before, at another exposure, those whose exposure
-            followed from it leave the session.
+            followed from it leave the session. Where a dark step is refused, pictures on the panel leave it that are
+            of the same blackout: the light that it lets in was in them, too.
     """
-    captures = take_step(step, bench, writer, start_s)
+    try:
+        captures = take_step(step, bench, writer, start_s)
+    except CaptureError:
+        alike = {one.id: one.arrangement for one in steps if one.instruction == step.instruction}
+        if isinstance(step.arrangement, Dark) and any(isinstance(one, PanelPicture) for one in alike.values()):
+            writer.drop(alike)
+        raise
     writer.add_step(
         step.id, step.term, _subject(step, writer), captures, _stale(step.id, _first_s(captures), writer, steps)
     )

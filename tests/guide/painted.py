@@ -40,13 +40,14 @@ class PaintedRig:
         asked: what the guide asked for, in order.
         put: what a test has put there instead; None for what was asked for.
         drift_px: how far an LED moves to the right from frame to frame.
+        leak_per_s: light of the room, in full wells per second.
     """
 
     def __init__(self, rig: RigDescription, offset_px: float = 0.0) -> None:
         self.rig, self.offset_px = rig, offset_px
         self.asked: list[Arrangement] = []
         self.put: Arrangement | None = None
-        self.drift_px = 0.0
+        self.drift_px = self.leak_per_s = 0.0
         self.frames_taken = 0
         self._settings = Settings(1e-3, 0.0, self.sensor)
 
@@ -99,7 +100,7 @@ class PaintedRig:
         full_s = _FULL_S.get(type(shown), 1.0)
         well_DN = camera.full_well_e.value * camera.K_DN_per_e.value
         rng = np.random.default_rng(self.frames_taken)
-        signal = np.minimum(light * self._settings.exposure_s / full_s, 1.0) * well_DN
+        signal = np.minimum((light / full_s + self.leak_per_s) * self._settings.exposure_s, 1.0) * well_DN
         noise = rng.standard_normal(signal.shape) * np.sqrt(2.0 + camera.K_DN_per_e.value * signal)
         return np.clip(np.rint(camera.black_DN.value + signal + noise), 0, 4095).astype(np.uint16)
 

@@ -9,6 +9,8 @@ import pytest
 from tests.guide.painted import PaintedRig, painted_bench, painted_rig
 from tests.guide.scripted import Reaction, Scripted
 from udccal.arrangements import Board, Dark, FlatLight, Led
+from udccal.benches.capture import capture
+from udccal.errors import CaptureError
 from udccal.guide.capture import guided_steps, lead_capture
 from udccal.guide.events import Answer, Event, ProgressEvent, ReadingsEvent, StepEvent, VerdictEvent, in_order
 from udccal.rig import load_rig
@@ -151,6 +153,32 @@ def test_a_wrong_set_up_is_refused(tmp_path: Path, term: TermName, step_id: str,
 
 
 @pytest.mark.medium
+@pytest.mark.parametrize("guided", [True, False])
+def test_light_that_only_the_dark_step_shows_was_in_the_pictures_before_it_too(tmp_path: Path, guided: bool) -> None:
+    painted = PaintedRig(painted_rig())
+    painted.leak_per_s = 20.0
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if not isinstance(event, VerdictEvent) or event.ok:
+            return None
+        assert Session.open(tmp_path).steps("backscatter") == ()
+        painted.leak_per_s = 0.0
+        return Answer.go
+
+    if guided:
+        person = led(tmp_path, ["backscatter"], react, painted)
+        assert "Expected a dark frame" in " ".join(person.sentences("backscatter/white"))
+    else:
+        with pytest.raises(CaptureError, match="Expected a dark frame"):
+            capture(tmp_path, painted_bench(painted), "backscatter")
+        painted.leak_per_s = 0.0
+        capture(tmp_path, painted_bench(painted), "backscatter")
+    session = Session.open(tmp_path)
+    white = next(step for step in session.steps("backscatter") if step.id == "backscatter/white")
+    # Without the room's light, white takes three times as long to reach its level.
+    assert white.captures[0].exposure_s > 0.05
+
+
 def test_a_missing_board_is_told(tmp_path: Path) -> None:
     painted = PaintedRig(painted_rig(4, board_views=2))
 

@@ -244,16 +244,21 @@ class SessionWriter:
             manifest = Manifest.model_validate(dict(self.manifest) | {"steps": steps})
         except ValidationError as error:
             raise SessionError(f"Expected the step '{step_id}' to fit docs/session.md, found: {error}") from error
-        before = self.manifest
-        self._write(manifest)
+        self._replace(manifest)
         self._invalid.discard(step_id)
         self.again -= {step_id, *without}
-        for name in _files(before) - _files(manifest):
-            file = self.path / name
-            if is_plain_file(self.path, file):  # what is behind a link is not the session's
-                with suppress(OSError):  # a file that stays does no harm
-                    file.unlink()
         return step
+
+    def drop(self, step_ids: Collection[str]) -> None:
+        """Leave captured steps out from now on, of which it has turned out that they are wrong; others are ignored.
+
+        Raises:
+            SessionError: when the disk is full or cannot be written to. The session stays as it was.
+        """
+        steps = tuple(each for each in self.manifest.steps if each.id not in step_ids)
+        if len(steps) < len(self.manifest.steps):
+            self._replace(self.manifest.model_copy(update={"steps": steps}))
+            self.again -= frozenset(step_ids)
 
     def _stem(self, step_id: str) -> str:
         """Return how the names of a step's files begin: not as those of a whole step that is to be replaced."""
@@ -266,6 +271,16 @@ class SessionWriter:
     def _steps_with(self, step: StoredStep) -> tuple[StoredStep, ...]:
         steps, number = self.manifest.steps, self.number(step.id)
         return (*steps[:number], step, *steps[number + 1 :])
+
+    def _replace(self, manifest: Manifest) -> None:
+        """Write another manifest, and remove the files that it no longer names."""
+        before = self.manifest
+        self._write(manifest)
+        for name in _files(before) - _files(manifest):
+            file = self.path / name
+            if is_plain_file(self.path, file):  # what is behind a link is not the session's
+                with suppress(OSError):  # a file that stays does no harm
+                    file.unlink()
 
     def _write(self, manifest: Manifest) -> None:
         with sentences("the manifest", self.path):

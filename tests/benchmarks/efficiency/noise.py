@@ -25,9 +25,8 @@ from udccal.fitting.noise.transfer import temporal_variance
 _SENSORS, _REALISATIONS = 50, 20
 
 
-# Parameters of the bound: K, V0, c, A, sigma_row^2, black, dark current, DSNU, PRNU, well (all DN), this sensor's mean
-# offset, lambda.
-_K, _V0, _BLACK, _RATE, _SPREAD, _SHAPE = 0, 1, 5, 6, 7, 11
+# Parameters of the bound: K, V0, c, A, sigma_row^2, black, dark current, DSNU, PRNU, well (all DN), lambda.
+_K, _V0, _BLACK, _RATE, _SPREAD, _SHAPE = 0, 1, 5, 6, 7, 10
 
 
 def bounds(sensor: ToySensor) -> dict[str, float]:
@@ -45,7 +44,6 @@ def bounds(sensor: ToySensor) -> dict[str, float]:
             (K * sensor.DSNU_e) ** 2,
             sensor.PRNU**2,
             full,
-            0.0,
             sensor.shape,
         ]
     )
@@ -56,15 +54,15 @@ def bounds(sensor: ToySensor) -> dict[str, float]:
     return dict(zip(truth(sensor), cramer_rao(information, slopes).tolist(), strict=True))
 
 
-def _quantities(x: Float[Array, "12"]) -> Float[Array, "10"]:
-    K, V0, c, _, row2, black, rate, spread2, uneven2, full, _, shape = x
+def _quantities(x: Float[Array, "11"]) -> Float[Array, "10"]:
+    K, V0, c, _, row2, black, rate, spread2, uneven2, full, shape = x
     values = [K, black, black + full, jnp.sqrt(V0 + row2) / K, shape, jnp.sqrt(row2), rate / K, jnp.sqrt(spread2) / K]
     return jnp.stack([*values, jnp.sqrt(uneven2), c * full])
 
 
-def _statistics(sensor: ToySensor, x: Float[Array, "12"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def _statistics(sensor: ToySensor, x: Float[Array, "11"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Everything that the frames say, as means of independent normal numbers; their variances are taken for known."""
-    K, V0, c, gain, row2, black, rate, spread2, uneven2, full, offset, shape = x
+    K, V0, c, gain, row2, black, rate, spread2, uneven2, full, shape = x
     pixels, frames = sensor.rows * sensor.columns, sensor.stack_frames
     stack_s = sensor.exposure_s(sensor.stack_level)
     parts: list[tuple[Array, Array]] = []
@@ -82,13 +80,12 @@ def _statistics(sensor: ToySensor, x: Float[Array, "12"]) -> tuple[Float[Array, 
     bright(stack_s, frames)
     for t, count in [(t, 2) for t in sensor.dark_times_s] + [(stack_s, frames)]:
         v = V0 + 1 / 12 + K * rate * t
-        parts.append((black + rate * t + offset, (v / pixels + row2 / sensor.rows) / count))
+        parts.append((black + rate * t, (v / pixels + row2 / sensor.rows) / count))
         row = row2 + v / sensor.columns
         parts.append((row, 2 * row**2 / (sensor.rows * (count - 1))))
         if count > 2:
             tails = excess_kurtosis(sensor.shape) * (V0 / v) ** 2
             parts.append((v, (2 + tails * (1 - 1 / count)) * v**2 / (pixels * (count - 1))))
-    parts.append((offset, spread2 / pixels))
     averaged = spread2 + (V0 + 1 / 12 + K * rate * stack_s + row2) / frames
     # The sensor at hand has these patterns; only what is temporal scatters.
     parts.append((averaged, 2 * (averaged**2 - spread2**2) / pixels))
@@ -96,13 +93,13 @@ def _statistics(sensor: ToySensor, x: Float[Array, "12"]) -> tuple[Float[Array, 
     quiet = V0 + 1 / 12 + K * rate * stack_s
     uneven = uneven2 + (temporal_variance(z, K, V0, c, 1 / 12) + quiet) / frames / (gain * stack_s) ** 2
     parts.append((uneven, 2 * (uneven**2 - uneven2**2) / pixels))
-    parts.append((black + full + offset, ((V0 + 1 / 12) / pixels + row2 / sensor.rows) / 2))
+    parts.append((black + full, ((V0 + 1 / 12) / pixels + row2 / sensor.rows) / 2))
     # Nothing here tells of the shape.
     mean, variance = (jnp.stack(part) for part in zip(*parts, strict=True))
     return mean + 0.0 * shape, jax.lax.stop_gradient(variance)
 
 
-def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Float[np.ndarray, "3 3"]:
+def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "11"]) -> Float[np.ndarray, "3 3"]:
     """Return the information on gain, read variance and shape in the expected joint histograms of the dark pairs.
 
     The counts of dark current carry information about the gain. Row noise is that of these frames, and so known. Black,

@@ -59,7 +59,7 @@ def test_the_response_and_its_bend_are_among_the_diagnostics() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_terms_that_are_there_are_chosen(seed: int) -> None:
-    there = np.random.default_rng([seed, 3]).random(6) < 0.5
+    there = np.random.default_rng([seed, 3]).random(5) < 0.5
     assert chosen_terms(measure(sensor_with(there), 50 + seed)) == tuple(there.tolist())
 
 

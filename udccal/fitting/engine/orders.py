@@ -167,17 +167,22 @@ class Quantity:
     ) -> Quantity:
         """The value if it raises the likelihood (minus twice the logarithm) by more than BIC requires.
 
+        The variance includes that the choice may be wrong (``Choice.spread``): a value that is there but too small to
+        be asked for is further from its default than its own error says.
+
         Args:
             name: for the table of candidates.
-            value, variance: the estimate; its variance is kept where the value is not.
+            value, variance: the estimate; without ``gain`` it cannot be negative.
             samples: number of data that determine it.
             gain: of the likelihood; by default that of a normal estimate, 0 for a value below 0.
             without: the value where the data do not support it.
         """
         own = value**2 / variance if value > 0 and variance > 0 else 0.0
         simple = Attempt(f"without {name}", 0, own if gain is None else gain, without)
-        choice = choose((simple, Attempt(f"with {name}", 1, bic(0.0, 1.0, samples), value)))
-        return cls(choice.best.fit, variance, choice.best.parameters > 0, choice.candidates)
+        there = max(value, 0.0) if gain is None else value
+        choice = choose((simple, Attempt(f"with {name}", 1, bic(0.0, 1.0, samples), there)))
+        spread = float(choice.spread(samples, np.atleast_1d)[0, 0])
+        return cls(choice.best.fit, variance + spread, choice.best.parameters > 0, choice.candidates)
 
     def root(self) -> tuple[float, float]:
         """The standard deviation, and its derivative by the variance, where the value is a variance.

@@ -13,7 +13,6 @@ from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.codes import (
     LOW,
-    NORMAL_SHAPE,
     DarkFit,
     DarkPair,
     Five,
@@ -76,19 +75,18 @@ def fit_dark_terms(
         row, unresolved = row_noise(data, np.zeros(len(data.darks)))[0], rounding
     else:
         unresolved = 0.0
-    free, normal = (_with_drawn_rows(one, data, in_pairs) for one in (fit, fitted(in_pairs, fit.values, True)))
     if in_pairs > 0 and np.abs(gains - 1).max() > rules.white:
         # Rounding hides part of the row noise, and what is wrong with it is taken for read noise.
-        free = free.doubted(fitted(float(np.sqrt(max(in_pairs**2 - row.variance**0.5, 0.0))), fit.values).values)
-    value, variance = float(free.values[4]), float(free.cov[4, 4])
-    name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
-    shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
-    fit = free if shape.there else normal
+        less = fitted(float(np.sqrt(max(in_pairs**2 - row.variance**0.5, 0.0))), fit.values).values
+    else:
+        less = fit.values
+    fit = _with_drawn_rows(fit, data, in_pairs).doubted(less)
+    shape = Quantity(float(fit.values[4]), float(fit.cov[4, 4]))
     # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
     white = fit.follows and 4 * np.pi**2 * float(fit.values[2]) >= rules.smeared * data.q_DN**2
     if not white:
         # Coarse codes hardly show the distribution, and all that they tell but its shape depends on it.
-        fit = fit.doubted(np.append((fit.values + free.values - normal.values)[:4], fit.values[4]))
+        fit = fit.doubted(np.append(fitted(in_pairs, fit.values, True).values[:4], fit.values[4]))
         fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
     (_, rate, read, spread2, _), variance = fit.values.tolist(), float(fit.cov[2, 2])
     read_DN2, shot = Quantity(read, variance), K_DN_per_e * max(rate, 0.0)
@@ -113,7 +111,7 @@ def fit_dark_terms(
     offsets = dsnu(stack.mean_DN, temporal, in_pairs**2 / stack.frames, rules.defect_sigma)
     if not white:
         pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, unresolved))
-        offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
+        offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels)
     black, levels_cov, current = _levels(data, fit, in_pairs**2, single.value, offsets, curvature)
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
     return DarkTerms(
@@ -169,8 +167,6 @@ def _levels(
     line = cov @ (design.T @ (means / variances))
     cov[1, 1] = cov[1, 1] if apart else (line[0] / max(float(times[0]), 1e-6)) ** 2
     current = Quantity.asked("dark current", float(line[1]), float(cov[1, 1]), data.dark_samples)
-    # The offsets of this sensor's pixels are one draw: their mean is not that of all sensors alike.
-    cov[0, 0] += offsets.mean_variance
     if not fit.follows:
         # With coarse or cut-off codes, the errors of black, spread and noise are common to all pairs.
         cov[[0, 1], [0, 1]] = np.maximum(np.diag(cov), np.diag(fit.cov)[:2] * [len(data.darks), 1])

@@ -183,7 +183,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     if fit.misfit.ratio > rules.worst_chi2 or bent_too_far:
         status = FitStatus.POOR_FIT
     shown = len(NAMES) - (not fit.order.curved)
-    terms = (dark.row_DN2, dark.shape, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
+    terms = (dark.row_DN2, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
     candidates = [*(one for term in terms for one in term.candidates), *response.candidates]
     outside = len(data.darks) * data.flat_stack.mean_DN.size - data.dark_samples
     height, width = data.flat_stack.mean_DN.shape
@@ -239,8 +239,6 @@ def _values(
     # Inner quantities: K, V0, c, sigma_row^2, black, rate, saturation, shape, DSNU^2, PRNU^2.
     inner = np.diag([0.0] * 6 + [level_sigma**2, dark.shape.variance, dark.dsnu_DN2.variance, PRNU2.variance])
     inner[:3, :3], inner[3, 3], inner[4:6, 4:6] = transfer, dark.row_DN2.variance, dark.levels_cov
-    if 0 < level < data.top_DN:
-        inner[[4, 6, 6], [6, 4, 6]] += dark.offsets.mean_variance
     jacobian = np.zeros((11, 10))
     jacobian[[0, 1, 2, 4], [0, 4, 6, 7]] = 1.0
     jacobian[3, [0, 1, 3]] = -sigma_d / K**2, by_total / K, by_total / K

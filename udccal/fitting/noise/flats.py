@@ -183,13 +183,12 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     # Hits were left out of the stack: where tails of the noise were taken for hits, it shows too little.
     if seen is not None and dark.white and not dark.foreign:
         # The tails are the read noise's: rounding and counts of dark current have hardly any.
-        excess = excess_kurtosis(dark.shape.value) if dark.shape.there else 0.0
-        tails = excess * min(read.value, seen.temporal_DN2) ** 2 * (1 - 1 / seen.frames)
+        tails = excess_kurtosis(dark.shape.value) * min(read.value, seen.temporal_DN2) ** 2 * (1 - 1 / seen.frames)
         sigma = float(np.sqrt((2 * seen.temporal_DN2**2 + tails) / float(seen.dof.sum())))
         points.append((seen.temporal_DN2 - rounding - K * rate * seen.exposure_s, sigma, rate * seen.exposure_s))
     values, sigmas, drifts = np.array(points).T
     # An error of black acts on the curve as an error of V0 that is K times as large.
-    shifted = K * np.sqrt(max(float(dark.levels_cov[0, 0]) - dark.offsets.mean_variance, 0.0))
+    shifted = K * np.sqrt(float(dark.levels_cov[0, 0]))
     return DarkVariance(values, np.hypot(np.maximum(sigmas, 1e-9), shifted), rounding, K, drifts)
 
 
@@ -216,7 +215,7 @@ def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
 
 
 def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[float, float]:
-    """Level in DN at which the signal stops, with its sigma (patterns of the offsets not counted).
+    """Level in DN at which the signal stops, with its sigma.
 
     It is the mean of the bins in which every pixel is full, or the last code where codes end before the full well. In
     between, it follows from the fraction of samples at the end. Where no bin is full, full pixels may pile up.

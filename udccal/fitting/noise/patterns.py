@@ -65,9 +65,8 @@ class Pattern:
 
     It is that of the pixels at hand (EMVA 1288), not of all sensors of the kind: the draw of these is no part of sigma.
 
-    ``mean`` is that of the samples left in, and ``mean_variance`` its variance from sensor to sensor by these patterns
-    alone; ``places`` are (row, column) of the first outliers. ``structure2`` is a variance between pixels that is not
-    white, so that it was taken for the light's; 0 where it cannot be seen.
+    ``mean`` is that of the samples left in; ``places`` are (row, column) of the first outliers. ``structure2`` is a
+    variance between pixels that is not white, so that it was taken for the light's; 0 where it cannot be seen.
     """
 
     variance: float
@@ -76,7 +75,6 @@ class Pattern:
     outliers: int
     places: tuple[tuple[int, int], ...]
     mean: float = 0.0
-    mean_variance: float = 0.0
     structure2: float = 0.0
 
 
@@ -103,8 +101,7 @@ def dsnu(dark_DN: Picture, temporal: Quantity, row_DN2: float, defect_sigma: flo
     # Each part is chi-squared with its own number of values; this sensor's own pattern is what is asked for.
     drawn = float(np.sum(2 * np.maximum(parts**2 - own**2, 0.0) / counts))
     sigma = float(np.sqrt(drawn + temporal.variance))
-    variance, of_mean = total - temporal.value - row_DN2, float(np.sum(own / counts))
-    return Pattern(variance, sigma, samples, int(bad.sum()), _first_places(bad), mean, of_mean)
+    return Pattern(total - temporal.value - row_DN2, sigma, samples, int(bad.sum()), _first_places(bad), mean)
 
 
 def _first_places(bad: Mask) -> tuple[tuple[int, int], ...]:
