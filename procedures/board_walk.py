@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Final, final
@@ -14,7 +13,17 @@ from scipy.spatial.transform import Rotation
 from procedures.aiming import nominal_pixels
 from procedures.live import LiveFrames
 from procedures.plans import Metered
-from procedures.readings import CornersSeen, corners_in, find_corners, head_room, sharpness, why_not
+from procedures.readings import (
+    STILL_LOOKS,
+    CornersSeen,
+    corners_in,
+    find_corners,
+    head_room,
+    moved_px,
+    movement,
+    sharpness,
+    why_not,
+)
 from procedures.step import Bench, Step, run_step, set_up
 from udccal.arrangements import Board, BoardSpec
 from udccal.guide.events import Outline, Reading
@@ -24,8 +33,6 @@ from udccal.rig import RigDescription
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 
-_STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 1.0, 3, math.inf
-_FEWEST_COMMON: Final = 4
 _IN_VAIN_LOOKS: Final = 15  # with too few corners, after which another pose is suggested
 _UNLIKE: Final = 0.02  # of the sensor's width, by which the corners of two views differ at least
 
@@ -58,7 +65,7 @@ class BoardVisit:
         self._views: list[CornersSeen] = []
         for seen in _captured(step_ids, writer, poses[0].spec):
             self._count(seen)
-        self._seen: deque[CornersSeen] = deque(maxlen=_STILL_LOOKS)
+        self._seen: deque[CornersSeen] = deque(maxlen=STILL_LOOKS)
         self._in_vain = 0
         self._asked = self._ask()
         step = self._asked
@@ -77,7 +84,7 @@ class BoardVisit:
         room, seen = head_room(level, self._target), find_corners(frame, self._board.spec)
         corners = seen.reading(self._board.spec)
         self._seen.append(seen)
-        readings = (room, corners, sharpness(frame), _movement(self._seen), self._unlike(seen))
+        readings = (room, corners, sharpness(frame), movement(self._seen), self._unlike(seen))
         wanted = Outline(_polygon(_edge(self._rig, self._board)), "wanted")
         return Look(frame, readings, self._why_not(readings), (wanted, *seen.outlines))
 
@@ -105,11 +112,11 @@ class BoardVisit:
 
     def _unlike(self, seen: CornersSeen) -> Reading:
         width = float(self._rig.camera.columns)
-        nearest = min((_moved_px(view, seen) for view in self._views), default=width)
+        nearest = min((moved_px(view, seen) for view in self._views), default=width)
         return Reading("unlike other views", nearest, _UNLIKE * width, None, "px")
 
     def _why_not(self, readings: tuple[Reading, ...]) -> str:
-        room, corners, sharp, movement, unlike = readings
+        room, corners, sharp, moving, unlike = readings
         if not room.ok:
             return why_not(room)
         if not corners.ok:
@@ -118,8 +125,8 @@ class BoardVisit:
                 f"{corners.value:.0f} of the board's corners are seen, at least {corners.low:.0f} are needed. Hold the "
                 "board in the outline, evenly lit and flat."
             )
-        if not movement.ok:
-            return "Hold the board still."
+        if not moving.ok:
+            return why_not(moving)
         if not sharp.ok:
             return why_not(sharp)
         if not unlike.ok:
@@ -134,21 +141,6 @@ class BoardVisit:
         if self._in_vain >= _IN_VAIN_LOOKS:
             self._asked = self._ask()
             self._seen.clear()
-
-
-def _movement(looks: deque[CornersSeen]) -> Reading:
-    """Return the largest movement of a corner over the last looks; unknown, and too large, before there are enough."""
-    moved = _UNKNOWN_PX
-    if len(looks) == _STILL_LOOKS:
-        moved = max(_moved_px(earlier, looks[-1]) for earlier in looks)
-    return Reading("movement", moved, None, _STILL_PX, "px")
-
-
-def _moved_px(one: CornersSeen, other: CornersSeen) -> float:
-    common, first, second = np.intersect1d(one.numbers, other.numbers, return_indices=True)
-    if len(common) < _FEWEST_COMMON:
-        return _UNKNOWN_PX
-    return float(np.median(np.linalg.norm(one.points_px[first] - other.points_px[second], axis=1)))
 
 
 def _edge(rig: RigDescription, board: Board) -> Float[np.ndarray, "4 2"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
@@ -13,6 +15,7 @@ from procedures.metering import spot_light
 from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame
 from udccal.guide.events import Outline, Reading
+from udccal.mounting import nominal_rotation
 from udccal.rig import RigDescription
 from udccal.sessions.patches import brightest_patch_DN
 
@@ -21,6 +24,12 @@ _UNEVEN = 15.0  # % of an even light's brightest patch that the darkest has at l
 _ROOM = 50.0  # % of an LED's light that its surroundings may have
 _FEWEST_CORNERS, _ENOUGH_CORNERS = 6, 12  # a quarter of the board, within these bounds
 _LEAST_HEAD_ROOM = 12.0  # %: tolerances of full well and gain leave the true level uncertain
+# Looks over which a board must be still, and how far its corners may move.
+STILL_LOOKS: Final = 3
+_STILL_PX, _UNKNOWN_PX, _FEWEST_COMMON = 1.0, math.inf, 4
+_LEAN_DEG = (
+    2.0  # of a board on the jig, in addition to the mounting's tolerances: what the lens's distortion turns it by
+)
 _MAGNIFIED_BELOW_PX = 600  # markers of few pixels are found more reliably in a magnified picture
 # Half the side of the window in which an LED's place is measured.
 _ABOUT_PX: Final = 12
@@ -153,6 +162,37 @@ def corners_in(mosaic: Shaped[np.ndarray, "rows columns"], spec: BoardSpec) -> C
     return CornersSeen(np.asarray(numbers, np.int64).reshape(-1), points)
 
 
+def movement(looks: Sequence[CornersSeen]) -> Reading:
+    """Return the largest movement of a corner over the last looks; unknown, and too large, before there are enough."""
+    moved = _UNKNOWN_PX
+    if len(looks) == STILL_LOOKS:
+        moved = max(moved_px(earlier, looks[-1]) for earlier in looks)
+    return Reading("movement", moved, None, _STILL_PX, "px")
+
+
+def moved_px(one: CornersSeen, other: CornersSeen) -> float:
+    """Return the median distance of the corners that two looks have in common; infinite where these are too few."""
+    common, first, second = np.intersect1d(one.numbers, other.numbers, return_indices=True)
+    if len(common) < _FEWEST_COMMON:
+        return _UNKNOWN_PX
+    return float(np.median(np.linalg.norm(one.points_px[first] - other.points_px[second], axis=1)))
+
+
+def lean(seen: CornersSeen, spec: BoardSpec, rig: RigDescription) -> Reading:
+    """Return the angle between a board and the panel, as a nominal camera sees it; 0 for a board on the jig."""
+    mounting, turn_deg = rig.mounting, math.inf
+    if len(seen.numbers) >= _FEWEST_CORNERS:
+        down, across = np.divmod(seen.numbers, spec.columns - 1)
+        corners = np.stack([across + 1.0, down + 1.0, 0.0 * down], axis=1) * spec.square_mm
+        camera = np.array(
+            [[rig.focal_px, 0, (rig.camera.columns - 1) / 2], [0, rig.focal_px, (rig.camera.rows - 1) / 2], [0, 0, 1]]
+        )
+        turn = cv2.Rodrigues(cv2.solvePnP(corners, seen.points_px, camera, None)[1])[0]
+        turn_deg = math.degrees(math.acos(min(abs(float((nominal_rotation(rig) @ turn)[2, 2])), 1.0)))
+    most_deg = mounting.tilt_deg.tolerance + mounting.yaw_deg.tolerance + _LEAN_DEG
+    return Reading("lean of the board", turn_deg, None, most_deg, "deg")
+
+
 def sharpness(frame: Frame) -> Reading:
     """Return the steepest edges of a picture of black and white, per px; 0.5 for the sharpest that pixels can show."""
     picture = cv2.blur(frame.data.astype(np.float32), (2, 2))
@@ -170,6 +210,10 @@ def why_not(reading: Reading) -> str:
             return "The light is too bright for this exposure; a shorter one is tried. If this stays, dim the light."
         case "head-room":
             return "Little light is seen; a longer exposure is tried. If this stays, see that the light is on."
+        case "movement":
+            return "Hold the board still."
+        case "lean of the board":
+            return f"The board leans by {reading.value:.0f} degrees against the display. Lay it flat on the jig."
         case "sharpness":
             return "The picture is blurred. Hold still what is seen, and check the focus."
         case _:

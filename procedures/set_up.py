@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import groupby
 from typing import final
@@ -9,7 +10,18 @@ from typing import final
 from procedures.live import LONGEST_S, LiveFrames
 from procedures.metering import trial_frame
 from procedures.plans import Fixed, Metered, TimesThatOf
-from procedures.readings import evenness, find_corners, head_room, light_leak, sharpness, why_not
+from procedures.readings import (
+    STILL_LOOKS,
+    CornersSeen,
+    evenness,
+    find_corners,
+    head_room,
+    lean,
+    light_leak,
+    movement,
+    sharpness,
+    why_not,
+)
 from procedures.step import Bench, Step, exposure_of, run_step, set_up
 from udccal.arrangements import Board, Dark, FlatLight, Stage
 from udccal.cameras.protocol import Camera, Frame
@@ -73,6 +85,7 @@ class SetUpVisit:
         plan = self._shown.exposure if isinstance(self._shown.exposure, Metered) else _LOOKED_AT
         self._live = LiveFrames(bench.camera, self._shown.region, plan, self._rig)
         self._target = plan.target
+        self._seen: deque[CornersSeen] = deque(maxlen=STILL_LOOKS)
 
     def look(self) -> Look:
         """Take a frame of what stands before the camera, and say whether it is what the step needs."""
@@ -86,9 +99,9 @@ class SetUpVisit:
             case FlatLight():
                 return self._judged(frame, (room, evenness(frame, self._rig)))
             case Board(spec):
-                seen = find_corners(frame, spec)
-                readings = (room, seen.reading(spec), sharpness(frame))
-                return self._judged(frame, readings, seen.outlines)
+                self._seen.append(seen := find_corners(frame, spec))
+                resting = (movement(self._seen), lean(seen, spec, self._rig))
+                return self._judged(frame, (room, seen.reading(spec), *resting, sharpness(frame)), seen.outlines)
             case _:
                 return self._judged(frame, (room,))
 

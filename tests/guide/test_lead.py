@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from procedures.aiming import board_facing
+from procedures.geometry import board_spec
 from tests.guide.painted import PaintedRig, painted_bench, painted_rig
 from tests.guide.scripted import Reaction, Scripted
 from udccal.arrangements import Board, Dark, FlatLight, Led
@@ -193,6 +195,29 @@ def test_a_missing_board_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.medium
+def test_a_board_beside_the_jig_is_never_in_order(tmp_path: Path) -> None:
+    """Its view defines the panel's frame: whoever agrees to all that is in order must not agree to this."""
+    painted = PaintedRig(painted_rig(4))
+    spec = board_spec(painted.rig)
+    middle = tuple((size - 1) / 2 for size in (painted.rig.camera.columns, painted.rig.camera.rows))
+    leaning = board_facing(painted.rig, spec, middle, 700.0, (0.0, 0.0, 0.0))
+    looks = 0
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        nonlocal looks
+        painted.put = leaning if looks < 6 else None
+        if isinstance(event, ReadingsEvent) and event.step_id == "geometry/panel":
+            looks += 1
+            assert looks > 5 or not in_order(event.readings, event.sentence)
+        return Answer.quit if isinstance(event, StepEvent) and event.step_id == "geometry/views" else None
+
+    person = led(tmp_path, ["geometry"], react, painted)
+    assert "The board leans by 17 degrees against the display. Lay it flat on the jig." in person.sentences(
+        "geometry/panel"
+    )
+    assert "geometry/panel" in {step.id for step in Session.open(tmp_path).manifest.steps}
+
+
 def test_the_same_view_again_is_not_taken(tmp_path: Path) -> None:
     painted = PaintedRig(painted_rig(4, board_views=3))
 
