@@ -121,7 +121,7 @@ DEVICE_TARGETS = (
     Target("chunks", _chunks, lambda: (_CHUNKS,), 512),
     Target("manifest", parse_entry, lambda: (_ENTRY_BYTES[:64],), 128),
     Target(
-        "zip",
+        "description-zip",
         lambda data: unpacked(data, 1),
         lambda: (zipped("<RegisterDescription/>"), zipped(_description().decode())),
         32768,

@@ -10,15 +10,14 @@ from tests.fuzz.plan_targets import PLAN_TARGETS
 from tests.fuzz.profile_targets import PROFILE_TARGETS
 from tests.fuzz.validate_targets import VALIDATE_TARGETS
 
-TARGETS = {
-    target.name: target
-    for target in (
-        *DEVICE_TARGETS,
-        *FILE_TARGETS,
-        *EXCHANGE_TARGETS,
-        *PLAN_TARGETS,
-        *PROFILE_TARGETS,
-        *DIFF_TARGETS,
-        *VALIDATE_TARGETS,
-    )
-}
+_ALL = (
+    *DEVICE_TARGETS,
+    *FILE_TARGETS,
+    *EXCHANGE_TARGETS,
+    *PLAN_TARGETS,
+    *PROFILE_TARGETS,
+    *DIFF_TARGETS,
+    *VALIDATE_TARGETS,
+)
+TARGETS = {target.name: target for target in _ALL}
+assert len(TARGETS) == len(_ALL), "two targets have one name, so that one of them would not be tried"

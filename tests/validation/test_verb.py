@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -52,7 +53,7 @@ def test_another_day_is_predicted_and_terms_without_captures_are_not_counted(fol
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert document == json.loads((out / "validation.json").read_text(encoding="utf-8"))
-    assert (document["ok"], document["own_session"]) == (True, False)
+    assert (document["ok"], document["own_terms"]) == (True, [])
     for check in document["checks"]:
         assert list(check) == ["term", "name", "value", "limit", "unit", "ok", "what"]
         assert check["what"].endswith(".")
@@ -70,7 +71,9 @@ def test_a_gain_of_10_percent_more_has_status_3(folder: Path) -> None:
     done = validate(folder / "wrong", "--session", folder / "second")
     assert done.returncode == 3, done.stderr
     assert done.stdout.startswith("Do not rely on noise of this profile")
-    assert "0.9" in done.stdout
+    grows = re.search(r"their mean ([\d.]+) times as fast", done.stdout)
+    assert grows is not None, done.stdout
+    assert float(grows[1]) == pytest.approx(1 / 1.1, abs=0.03)
 
 
 def test_a_full_disk_is_said_and_nothing_is_left(folder: Path, nearly_full: Path) -> None:
@@ -92,8 +95,19 @@ def test_two_at_once_leave_one_whole_result(folder: Path, tmp_path: Path) -> Non
 
 def test_the_profiles_own_session_confirms_nothing(folder: Path) -> None:
     found = udccal.validate(load_profile(folder / "profile"), udccal.Session.open(folder / "first"))
-    assert found.own_session
-    assert "capture another one" in found.advice
+    counted = {check.term for check in found.checks if check.ok is not None}
+    assert set(found.own_terms) >= counted
+    assert "capture others" in found.advice
+
+
+def test_captures_stay_the_profiles_own_where_the_session_gains_others(folder: Path) -> None:
+    profile, more = load_profile(folder / "profile"), folder / "first, and more"
+    shutil.copytree(folder / "first", more)
+    truth = draw_truth(profile.rig, 0)
+    with simulated_bench(SimulatedWorld(truth, seed=len("first"))) as bench:
+        session = udccal.capture(more, bench, terms=("noise", "wire"))
+    assert len(session.steps("wire"))
+    assert udccal.validate(profile, session).own_terms == ("noise",)
 
 
 def test_a_term_without_its_dark_frames_is_not_counted(folder: Path) -> None:

@@ -25,7 +25,9 @@ def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> Validat
             _counted(found.checks),
             Fact("profile made", found.profile_created_at),
             Fact("session begun", found.session_created_at),
-            Fact("session", "the profile's own" if found.own_session else "another one"),
+            Fact(
+                "session", f"the profile's own for {', '.join(found.own_terms)}" if found.own_terms else "another one"
+            ),
         ),
         sections=_sections(found.checks, maps),
     )

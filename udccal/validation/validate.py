@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import final
@@ -12,9 +12,10 @@ from udccal.comparison.estimates import ORDER
 from udccal.errors import MissingStepError, SessionError
 from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile
-from udccal.result import FitStatus
+from udccal.result import FitResult, FitStatus
+from udccal.sessions.evidence import captures_of
 from udccal.sessions.manifest import MANIFEST_NAME
-from udccal.sessions.schema import TermName
+from udccal.sessions.schema import StoredStep, TermName
 from udccal.sessions.store import Session
 from udccal.validation.backscatter import validate_backscatter
 from udccal.validation.checks import Check, Judged, ZMap
@@ -37,7 +38,7 @@ class Validation:
     Attributes:
         ok: whether every check that counts is within its limit.
         advice: one sentence that says what to do.
-        own_session: whether the profile was fitted to this session: most of its captures then confirm nothing.
+        own_terms: those that the profile fitted to these very captures: most of them then confirm nothing.
         checks: of all terms, in their order.
     """
 
@@ -49,7 +50,7 @@ class Validation:
     profile_created_at: str
     session_created_at: str
     session_sha256: str
-    own_session: bool
+    own_terms: tuple[TermName, ...]
     checks: tuple[Check, ...]
     limits: ValidationLimits
 
@@ -84,12 +85,11 @@ def judge(
 ) -> tuple[Validation, Mapping[TermName, ZMap]]:
     """Validate, and keep the maps for figures; see ``validate``. ``progress`` gets each term when it begins."""
     check_same_rig(profile, session.rig, session.camera)
-    sha256 = sha256_file(session.path / MANIFEST_NAME)
-    own = sha256 == profile.provenance.session_sha256
+    own = tuple(term for term in ORDER if _own(profile.result(term), session.steps(term)))
 
     def one(term: TermName) -> Judged:
         progress(term)
-        return _judged(term, profile, session, limits, own)
+        return _judged(term, profile, session, limits, term in own)
 
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         judged = dict(zip(ORDER, pool.map(one, ORDER), strict=True))
@@ -106,11 +106,11 @@ def judge(
         version=VERSION,
         rig=profile.rig.name,
         ok=not failed,
-        advice=_advice(failed, own),
+        advice=_advice(failed, own, tuple(dict.fromkeys(check.term for check in counted))),
         profile_created_at=profile.provenance.created_at,
         session_created_at=session.manifest.created_at,
-        session_sha256=sha256,
-        own_session=own,
+        session_sha256=sha256_file(session.path / MANIFEST_NAME),
+        own_terms=own,
         checks=checks,
         limits=limits,
     )
@@ -148,12 +148,22 @@ def _not_counted(term: TermName, name: str, what: str) -> Judged:
     return Judged((Check(term, name, None, None, "", None, what),))
 
 
-def _advice(failed: tuple[TermName, ...], own: bool) -> str:
+def _own(result: FitResult, steps: Sequence[StoredStep]) -> bool:
+    """Whether a term was fitted to these captures; a session with other steps beside them has the same."""
+    return bool(steps) and result.captures is not None and result.captures.sha256 == captures_of(steps).sha256
+
+
+def _advice(failed: tuple[TermName, ...], own: tuple[TermName, ...], counted: tuple[TermName, ...]) -> str:
     if failed:
         terms = " and ".join(failed)
         return (
             f"Do not rely on {terms} of this profile for captures like these: calibrate the rig again, or look below."
         )
-    if own:
-        return "The profile describes the session that it was fitted to; capture another one to confirm it."
-    return "Go on with this profile: it predicts the session's captures."
+    if others := [term for term in counted if term not in own]:
+        if not own:
+            return "Go on with this profile: it predicts the session's captures."
+        return (
+            f"Go on with this profile: it predicts the session's captures of {' and '.join(others)}. Those of "
+            f"{' and '.join(own)} are the ones that it was fitted to, and confirm nothing."
+        )
+    return "The profile describes the captures that it was fitted to; capture others to confirm it."
