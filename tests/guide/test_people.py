@@ -132,10 +132,22 @@ def test_events_are_one_json_object_a_line(capsys: pytest.CaptureFixture[str]) -
     assert second["offered"] == ["go", "skip"]
 
 
-def typed(monkeypatch: pytest.MonkeyPatch, lines: str) -> TerminalPerson:
-    monkeypatch.setattr(sys, "stdin", io.StringIO(lines))
+class Typed(io.StringIO):
+    """Lines typed at a terminal, or piped in."""
+
+    terminal = False
+
+    def isatty(self) -> bool:
+        return self.terminal
+
+
+def typed(monkeypatch: pytest.MonkeyPatch, lines: str, terminal: bool = False) -> TerminalPerson:
+    stdin = Typed(lines)
+    stdin.terminal = terminal
+    monkeypatch.setattr(sys, "stdin", stdin)
     person = TerminalPerson(Output())
-    time.sleep(0.1)  # its thread reads
+    while person._lines.qsize() < lines.count("\n") + 1:  # its thread reads, up to the end
+        time.sleep(0.01)
     return person
 
 
@@ -151,6 +163,16 @@ def test_words_at_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert "'back' is none of the answers: Enter, skip." in said
     assert "'whatever' is none of the answers" in said
     assert said.count("[Enter · skip]") == 1
+
+
+def test_an_enter_typed_before_the_question_is_no_answer_and_a_word_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    person = typed(monkeypatch, "\n \nskip\n", terminal=True)
+    person.tell(VerdictEvent("wire/flat", True, "Captured.", ASKED))
+    assert person.answer(ASKED, 0.0) is Answer.skip
+    # What a program pipes in is all typed ahead.
+    person = typed(monkeypatch, "\n")
+    person.tell(VerdictEvent("wire/flat", True, "Captured.", ASKED))
+    assert person.answer(ASKED, 0.0) is Answer.go
 
 
 def test_a_closed_input_is_said_only_where_an_answer_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

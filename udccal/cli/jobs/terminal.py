@@ -39,7 +39,8 @@ class TerminalPerson:
     """Implements ``udccal.guide.events.Person``.
 
     Readings are printed when what they say changes, not with each frame. Standard input is read in a thread of its own,
-    line by line, so that frames go on while nobody types.
+    line by line, so that frames go on while nobody types. An Enter that was typed before a question does not answer it;
+    a word does.
     """
 
     def __init__(self, output: Output) -> None:
@@ -52,6 +53,8 @@ class TerminalPerson:
 
     def tell(self, event: Event) -> None:
         """Print an event."""
+        if isinstance(event, StepEvent | VerdictEvent) and sys.stdin.isatty():
+            self._forget_enters()
         match event:
             case StepEvent():
                 self._said, self._asked = "", ()
@@ -97,6 +100,15 @@ class TerminalPerson:
         said = "Enter alone" if word == "enter" else f"'{word[:40]}'"
         self._output.say(f"  {said} is none of the answers: {', '.join(_MEANING[answer] for answer in offered)}.")
         return None
+
+    def _forget_enters(self) -> None:
+        """Take back the Enters that nobody has asked for: an impatient one would accept what comes next unread."""
+        words = []
+        while not self._lines.empty():
+            line = self._lines.get_nowait()
+            words += [line] if line is _CLOSED or line.strip() else []
+        for line in words:
+            self._lines.put(line)
 
     def _check_open(self, wait_s: float) -> None:
         if self._closed and wait_s:
