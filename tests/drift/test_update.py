@@ -101,3 +101,16 @@ def test_the_gain_has_the_error_of_the_check(profile: Profile, session: Path) ->
     K = new.noise.estimate("K_DN_per_e")
     assert K.sigma == pytest.approx(0.001 * float(profile.noise.term.K_DN_per_e))  # 0.1 % in ``checked``
     assert new.noise.cov[0, 0] == pytest.approx(K.sigma**2)
+
+
+def test_the_place_keeps_the_checks_correlations(profile: Profile, session: Path) -> None:
+    found, solved = checked(profile, ("moved",))
+    cov = solved.pose.cov.copy()
+    cov[3, 4] = cov[4, 3] = 0.8e-6
+    solved = replace(solved, pose=replace(solved.pose, cov=cov))
+    wire = updated(profile, Path("lg55-reduced"), found, solved, session).wire
+    i, j = ([one.name for one in wire.estimates].index(name) for name in ("standoff_per_pitch", "offset_x_periods"))
+    sigma = np.sqrt(np.diag(wire.cov))
+    assert wire.cov[i, j] / sigma[i] / sigma[j] == pytest.approx(0.8)
+    assert (wire.estimates[i].sigma, wire.estimates[j].sigma) == pytest.approx((sigma[i], sigma[j]))
+    assert np.linalg.eigvalsh(wire.cov / np.outer(sigma, sigma)).min() > -1e-9

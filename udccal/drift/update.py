@@ -62,8 +62,8 @@ def _results(
     change, wire = solved.cause.values, profile.wire.term
     pitch = profile.rig.panel.pitch_mm.value
     x, y, z = movement_mm(wire, change, pitch)
-    sigma = np.sqrt(np.diag(solved.pose.cov))
-    away = float(wire.standoff_per_pitch)
+    # Of the turn (rad), the logarithm of the stand-off, and the place in periods.
+    cov = solved.pose.cov
     geometry = moved_geometry(profile.geometry.term, change)
     before, after = (angles_deg(np.asarray(one.rotation_rad)) for one in (profile.geometry.term, geometry))
     turned = dict(zip(ANGLES, after - before, strict=True)) if change[:3].any() else {}
@@ -71,7 +71,8 @@ def _results(
     moves = {"standoff_per_pitch": -z / pitch, "offset_x_periods": x / pitch, "offset_y_periods": y / pitch}
     shifts = {"standoff_mm": -z, "offset_x_px": -x / pitch, "offset_y_px": -y / pitch}
     moved = bool(change[3:6].any())
-    spread = {"standoff_per_pitch": away * sigma[3], "offset_x_periods": sigma[4], "offset_y_periods": sigma[5]}
+    by_place = np.diag([float(wire.standoff_per_pitch), 1.0, 1.0])
+    largest_deg2 = np.rad2deg(1.0) ** 2 * float(np.diag(cov)[:3].max())
     posed, K = bool(change.any()), float(profile.noise.term.K_DN_per_e)
     return (
         _changed(
@@ -79,16 +80,22 @@ def _results(
             replace(profile.noise.term, K_DN_per_e=np.asarray(profile.noise.term.K_DN_per_e) * gain.value),
             gain.value != 1,
             {"K_DN_per_e": K * (gain.value - 1)},
-            {"K_DN_per_e": K * gain.sigma},
+            np.array([[(K * gain.sigma) ** 2]]),
         ),
         _changed(
             profile.geometry,
             geometry,
             bool(change[:3].any() or change[6]),
             turned | focal,
-            dict.fromkeys(turned, float(np.rad2deg(sigma[:3].max()))),
+            largest_deg2 * np.eye(len(turned)),
         ),
-        _changed(profile.wire, moved_wire(wire, change), posed, moves if moved else {}, spread if moved else {}),
+        _changed(
+            profile.wire,
+            moved_wire(wire, change),
+            posed,
+            moves if moved else {},
+            by_place @ cov[3:6, 3:6] @ by_place if moved else None,
+        ),
         _changed(profile.psf, moved_psf(profile.psf.term, change), posed, {}),
         _changed(
             profile.backscatter,
@@ -108,26 +115,24 @@ def _changed(
     term: object,
     changed: bool,
     added: Mapping[str, float],
-    sigma: Mapping[str, float] | None = None,
+    own_cov: Float[np.ndarray, "some some"] | None = None,
 ) -> FitResult:
-    """The result with another term, with numbers added to its estimates, and the sigmas by the check.
+    """The result with another term, with numbers added to its estimates, and the check's covariance of the first ones.
 
     What changed is no fit of the old captures any more, and does not name them.
     """
     if not changed:
         return result
-    sigmas, cov = sigma or {}, result.cov.copy()
-    estimates = []
-    for index, one in enumerate(result.estimates):
-        if index < len(cov) and one.name in sigmas:
-            cov[index], cov[:, index] = 0.0, 0.0
-            cov[index, index] = sigmas[one.name] ** 2
-        estimates.append(
-            replace(
-                one,
-                value=float(one.value + added.get(one.name, 0.0)),
-                sigma=float(sigmas.get(one.name, one.sigma)),
-            )
-        )
+    cov, by_name = result.cov.copy(), {one.name: i for i, one in enumerate(result.estimates)}
+    own_cov = np.zeros((0, 0)) if own_cov is None else own_cov
+    own = [by_name[name] for name, _ in zip(added, own_cov, strict=False)]
+    sigmas = dict(zip(own, np.sqrt(np.diag(own_cov)).tolist(), strict=True))
+    inside = [i for i in own if i < len(cov)]
+    cov[inside], cov[:, inside] = 0.0, 0.0
+    cov[np.ix_(inside, inside)] = own_cov[: len(inside), : len(inside)]
+    estimates = tuple(
+        replace(one, value=float(one.value + added.get(one.name, 0.0)), sigma=sigmas.get(i, one.sigma))
+        for i, one in enumerate(result.estimates)
+    )
     notes = (f"{', '.join(added)} by a check of a few minutes; the other numbers are older.",) if added else ()
-    return replace(result, term=term, estimates=tuple(estimates), cov=cov, notes=(*result.notes, *notes), captures=None)
+    return replace(result, term=term, estimates=estimates, cov=cov, notes=(*result.notes, *notes), captures=None)
