@@ -6,38 +6,25 @@ import re
 import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from click import Command
+from typer.main import get_command
 
+from udccal.cli.app import app
 from udccal.cli.demo import demo
 
-VERBS = (
-    [],
-    ["demo"],
-    ["doctor"],
-    ["board"],
-    ["calibrate"],
-    ["fit"],
-    ["plan"],
-    ["restore"],
-    ["run"],
-    ["simulate"],
-    ["profile"],
-    ["profile", "show"],
-    ["profile", "diff"],
-    ["profile", "prepare"],
-    ["profile", "log"],
-    ["profile", "pack"],
-    ["profile", "unpack"],
-    ["profile", "migrate"],
-    ["profile", "export"],
-    ["profile", "import"],
-    ["rig"],
-    ["rig", "list"],
-    ["rig", "new"],
-    ["rig", "check"],
-)
+
+def _verbs(command: Command, words: list[str]) -> Iterator[list[str]]:
+    """Every verb and group of verbs, so that none is forgotten."""
+    yield words
+    for name, verb in getattr(command, "commands", {}).items():
+        yield from _verbs(verb, [*words, name])
+
+
+VERBS = list(_verbs(get_command(app), []))
 # typer itself loads pydantic, which is quick
 HEAVY = ("jax", "numpy", "cv2", "matplotlib", "scipy", "equinox", "rawpy", "OpenEXR")
 # An idle 2-core machine takes 0.5 s for the longest help and 0.3 s for the bare framework's; a slow one takes

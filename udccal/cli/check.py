@@ -39,7 +39,7 @@ def check(
         Path | None, typer.Option("--update", help="Write the profile with what changed solved for again.")
     ] = None,
 ) -> None:
-    """Check a rig against its profile: ten flats, some dark frames and three panel pictures, in a few minutes."""
+    """Check a rig against its profile: ten flats, twenty dark frames and three panel pictures, in three minutes."""
     from udccal.cli.jobs.check import check_profile
 
     options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed)
