@@ -15,6 +15,11 @@ from udccal.sessions.frame_checks import FrameLimits
 
 Check = Callable[[Frame, RigDescription], None]
 
+
+class NotDarkError(CaptureError):
+    """Light reaches a sensor that is to be in the dark."""
+
+
 _FAR = 100.0  # times: a camera without the exposure may lend its nearest; milliseconds for seconds are 1000 times off
 # Exposures in s at which fast lenses behind a panel fill most of a well. Wells, f-numbers and lights that are in use
 # change these by less than a hundred times.
@@ -54,11 +59,11 @@ def is_dark(frame: Frame, rig: RigDescription) -> None:
     """Check that no light reaches the sensor.
 
     Raises:
-        CaptureError: when the frame is brighter than black level and dark current can make it.
+        NotDarkError: when the frame is brighter than black level and dark current can make it.
     """
     leak = light_leak(frame, rig)
     if not leak.ok:
-        raise CaptureError(
+        raise NotDarkError(
             f"Expected a dark frame, found at least a part {leak.value - rig.camera.black_DN.tolerance:.0f} DN above "
             "the black level. Cap the lens, switch the panel off and close the blackout, then repeat the step."
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, final
 
@@ -27,9 +28,7 @@ _LEAST_HEAD_ROOM = 12.0  # %: tolerances of full well and gain leave the true le
 # Looks over which a board must be still, and how far its corners may move.
 STILL_LOOKS: Final = 3
 _STILL_PX, _UNKNOWN_PX, _FEWEST_COMMON = 1.0, math.inf, 4
-_LEAN_DEG = (
-    2.0  # of a board on the jig, in addition to the mounting's tolerances: what the lens's distortion turns it by
-)
+_LEAN_DEG = 2.0  # of a board on the jig, beyond the mounting's tolerances: the lens's distortion turns it
 _MAGNIFIED_BELOW_PX = 600  # markers of few pixels are found more reliably in a magnified picture
 # Half the side of the window in which an LED's place is measured.
 _ABOUT_PX: Final = 12
@@ -181,14 +180,15 @@ def moved_px(one: CornersSeen, other: CornersSeen) -> float:
 def lean(seen: CornersSeen, spec: BoardSpec, rig: RigDescription) -> Reading:
     """Return the angle between a board and the panel, as a nominal camera sees it; 0 for a board on the jig."""
     mounting, turn_deg = rig.mounting, math.inf
-    if len(seen.numbers) >= _FEWEST_CORNERS:
-        down, across = np.divmod(seen.numbers, spec.columns - 1)
-        corners = np.stack([across + 1.0, down + 1.0, 0.0 * down], axis=1) * spec.square_mm
-        camera = np.array(
-            [[rig.focal_px, 0, (rig.camera.columns - 1) / 2], [0, rig.focal_px, (rig.camera.rows - 1) / 2], [0, 0, 1]]
-        )
-        turn = cv2.Rodrigues(cv2.solvePnP(corners, seen.points_px, camera, None)[1])[0]
-        turn_deg = math.degrees(math.acos(min(abs(float((nominal_rotation(rig) @ turn)[2, 2])), 1.0)))
+    down, across = np.divmod(seen.numbers, spec.columns - 1)
+    corners = np.stack([across + 1.0, down + 1.0, 0.0 * down], axis=1) * spec.square_mm
+    # Corners in a line do not tell how a board lies.
+    if len(corners) >= _FEWEST_CORNERS and np.linalg.matrix_rank(corners - corners.mean(axis=0)) == 2:
+        camera = np.diag([rig.focal_px, rig.focal_px, 1.0])
+        camera[:2, 2] = (rig.camera.columns - 1) / 2, (rig.camera.rows - 1) / 2
+        with suppress(cv2.error):
+            turn = cv2.Rodrigues(cv2.solvePnP(corners, seen.points_px, camera, None)[1])[0]
+            turn_deg = math.degrees(math.acos(min(abs(float((nominal_rotation(rig) @ turn)[2, 2])), 1.0)))
     most_deg = mounting.tilt_deg.tolerance + mounting.yaw_deg.tolerance + _LEAN_DEG
     return Reading("lean of the board", turn_deg, None, most_deg, "deg")
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from procedures.capture import take
-from procedures.checks import Check, frame_limits, refuse_far_exposure, usual_exposure_s
+from procedures.checks import Check, NotDarkError, frame_limits, refuse_far_exposure, usual_exposure_s
 from procedures.metering import Exposed, meter, trial_frame
 from procedures.plans import Exposure, Fixed, Metered, Plan, TimesThatOf
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, Occasion, PanelPicture, Stage
@@ -90,7 +90,7 @@ def take_step(step: Step, bench: Bench, writer: SessionWriter, start_s: float | 
         captures = take(bench.camera, step.region, exposed.exposure_s, step.plan, limits, rig.camera.max_exposure_s)
         bench.display.check()
     except CaptureError as error:
-        raise CaptureError(f"Step {step.id}: {error}") from error
+        raise type(error)(f"Step {step.id}: {error}") from error
     return captures
 
 
@@ -105,19 +105,27 @@ def run_step(
         writer: gets the step.
         start_s: first guess of an exposure that is metered.
         steps: those of the procedure: where the step was captured before, at another exposure, those whose exposure
-            followed from it leave the session. Where a dark step is refused, pictures on the panel leave it that are
-            of the same blackout: the light that it lets in was in them, too.
+            followed from it leave the session, and so do those that a dark step has found to be in the light.
     """
     try:
         captures = take_step(step, bench, writer, start_s)
-    except CaptureError:
-        alike = {one.id: one.arrangement for one in steps if one.instruction == step.instruction}
-        if isinstance(step.arrangement, Dark) and any(isinstance(one, PanelPicture) for one in alike.values()):
-            writer.drop(alike)
+    except NotDarkError:
+        _leave_out_lit(step, writer, steps)
         raise
     writer.add_step(
         step.id, step.term, _subject(step, writer), captures, _stale(step.id, _first_s(captures), writer, steps)
     )
+
+
+def _leave_out_lit(dark: Step, writer: SessionWriter, steps: Iterable[Step]) -> None:
+    """Leave out the panel's pictures of a blackout whose dark step has found light: it was in them, too.
+
+    Those stay that an earlier run has captured together with a dark step.
+    """
+    alike = {one.id: one.arrangement for one in steps if one.instruction == dark.instruction}
+    pictures = {step_id for step_id, one in alike.items() if isinstance(one, PanelPicture)}
+    if pictures and (writer.step(dark.id) is None or pictures & writer.added):
+        writer.drop(alike)
 
 
 def _first_s(captures: Sequence[Capture]) -> float:

@@ -103,6 +103,13 @@ def test_the_gain_has_the_error_of_the_check(profile: Profile, session: Path) ->
     assert new.noise.cov[0, 0] == pytest.approx(K.sigma**2)
 
 
+def test_a_profile_without_a_pose_of_its_geometry_is_updated_too(profile: Profile, session: Path) -> None:
+    without = replace(profile, geometry=replace(profile.geometry, estimates=(), cov=np.zeros((0, 0))))
+    new = updated(without, Path("lg55-reduced"), *checked(without, ("tilted",)), session)
+    assert new.geometry.estimates == ()
+    assert np.abs(np.asarray(new.geometry.term.rotation_rad) - np.asarray(profile.geometry.term.rotation_rad)).max() > 0
+
+
 def test_the_place_keeps_the_checks_correlations(profile: Profile, session: Path) -> None:
     found, solved = checked(profile, ("moved",))
     cov = solved.pose.cov.copy()

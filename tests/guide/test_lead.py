@@ -11,7 +11,7 @@ from procedures.geometry import board_spec
 from tests.guide.painted import PaintedRig, painted_bench, painted_rig
 from tests.guide.scripted import Reaction, Scripted
 from udccal.arrangements import Board, Dark, FlatLight, Led
-from udccal.benches.capture import capture
+from udccal.benches.capture import capture, capture_term
 from udccal.errors import CaptureError
 from udccal.guide.capture import guided_steps, lead_capture
 from udccal.guide.events import Answer, Event, ProgressEvent, ReadingsEvent, StepEvent, VerdictEvent, in_order
@@ -154,7 +154,6 @@ def test_a_wrong_set_up_is_refused(tmp_path: Path, term: TermName, step_id: str,
     assert person.done.complete
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("guided", [True, False])
 def test_light_that_only_the_dark_step_shows_was_in_the_pictures_before_it_too(tmp_path: Path, guided: bool) -> None:
     painted = PaintedRig(painted_rig())
@@ -181,6 +180,20 @@ def test_light_that_only_the_dark_step_shows_was_in_the_pictures_before_it_too(t
     assert white.captures[0].exposure_s > 0.05
 
 
+def test_pictures_that_a_dark_step_has_confirmed_stay(tmp_path: Path) -> None:
+    """Where only the dark step is captured again, and finds light, the light came later."""
+    painted = PaintedRig(painted_rig())
+    whole = {step.id for step in capture(tmp_path, painted_bench(painted), "backscatter").manifest.steps}
+    painted.leak_per_s = 20.0
+    bench = painted_bench(painted)
+    with SessionWriter.create_or_resume(tmp_path, bench.rig, bench.camera.identity, now=bench.now) as writer:
+        writer.capture_again(["backscatter/dark"])
+        with pytest.raises(CaptureError, match="Expected a dark frame"):
+            capture_term(writer, bench, "backscatter", lambda done, total: None)
+    assert {step.id for step in Session.open(tmp_path).manifest.steps} == whole
+
+
+@pytest.mark.medium
 def test_a_missing_board_is_told(tmp_path: Path) -> None:
     painted = PaintedRig(painted_rig(4, board_views=2))
 
@@ -218,6 +231,7 @@ def test_a_board_beside_the_jig_is_never_in_order(tmp_path: Path) -> None:
     assert "geometry/panel" in {step.id for step in Session.open(tmp_path).manifest.steps}
 
 
+@pytest.mark.medium
 def test_the_same_view_again_is_not_taken(tmp_path: Path) -> None:
     painted = PaintedRig(painted_rig(4, board_views=3))
 

@@ -146,7 +146,9 @@ def typed(monkeypatch: pytest.MonkeyPatch, lines: str, terminal: bool = False) -
     stdin.terminal = terminal
     monkeypatch.setattr(sys, "stdin", stdin)
     person = TerminalPerson(Output())
-    while person._lines.qsize() < lines.count("\n") + 1:  # its thread reads, up to the end
+    for _ in range(500):  # its thread reads, up to the end
+        if person._lines.qsize() > lines.count("\n"):
+            break
         time.sleep(0.01)
     return person
 

@@ -100,6 +100,12 @@ def test_the_profiles_own_session_confirms_nothing(folder: Path) -> None:
     assert "capture others" in found.advice
 
 
+def test_a_profile_that_names_no_captures_is_known_by_its_session(folder: Path) -> None:
+    profile = with_result(load_profile(folder / "profile"), "noise", captures=None)
+    first, second = (udccal.validate(profile, udccal.Session.open(folder / day)) for day in ("first", "second"))
+    assert (first.own_terms, second.own_terms) == (("noise",), ())
+
+
 def test_captures_stay_the_profiles_own_where_the_session_gains_others(folder: Path) -> None:
     profile, more = load_profile(folder / "profile"), folder / "first, and more"
     shutil.copytree(folder / "first", more)

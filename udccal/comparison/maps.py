@@ -90,8 +90,10 @@ def _rays(
     rays = 0.5 * (np.asarray(image(other, seen_a)) - np.asarray(image(one, seen_b)))
     slopes = [_slopes(term, seen, image) for term, seen in ((one, seen_a), (other, seen_b))]
     turns = (0.5 * (slopes[0] + slopes[1]))[:, :, -3:].reshape(-1, 3)
-    check_finite(rays, turns)
-    lens = _without_turn(rays, turns.reshape(-1, 2, 3), _angles_per_px(one, pixels))
+    angles = 0.5 * (_angles_per_px(one, pixels) + _angles_per_px(other, pixels))
+    check_finite(rays, turns, angles)
+    lens = _without_turn(rays, turns.reshape(-1, 2, 3), angles)
+    check_finite(lens)
     if not (_of_lens_and_pose(a.geometry) and _of_lens_and_pose(b.geometry)):
         return rays, lens, None
     variance = sum(
@@ -119,7 +121,9 @@ def _without_turn(
         return np.asarray(((scale * (seen[..., 0] - by_turn @ turn)) ** 2).sum(axis=-1))
 
     start = np.linalg.lstsq(turns.reshape(-1, 3), rays.ravel() / unit, rcond=None)[0]
-    return rays - unit * (turns @ least_squares(squares, start, x_scale="jac").x)
+    with np.errstate(all="ignore"):
+        check_finite(squares(start) ** 2)
+        return rays - unit * (turns @ least_squares(squares, start, x_scale="jac").x)
 
 
 def _of_lens_and_pose(result: FitResult[Geometry]) -> bool:

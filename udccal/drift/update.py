@@ -125,11 +125,12 @@ def _changed(
         return result
     cov, by_name = result.cov.copy(), {one.name: i for i, one in enumerate(result.estimates)}
     own_cov = np.zeros((0, 0)) if own_cov is None else own_cov
-    own = [by_name[name] for name, _ in zip(added, own_cov, strict=False)]
-    sigmas = dict(zip(own, np.sqrt(np.diag(own_cov)).tolist(), strict=True))
+    own = {by_name[name]: k for k, name in enumerate(list(added)[: len(own_cov)]) if name in by_name}
+    sigmas = {i: float(np.sqrt(own_cov[k, k])) for i, k in own.items()}
     inside = [i for i in own if i < len(cov)]
     cov[inside], cov[:, inside] = 0.0, 0.0
-    cov[np.ix_(inside, inside)] = own_cov[: len(inside), : len(inside)]
+    at = [own[i] for i in inside]
+    cov[np.ix_(inside, inside)] = own_cov[np.ix_(at, at)]
     estimates = tuple(
         replace(one, value=float(one.value + added.get(one.name, 0.0)), sigma=sigmas.get(i, one.sigma))
         for i, one in enumerate(result.estimates)

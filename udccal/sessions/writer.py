@@ -47,6 +47,7 @@ class SessionWriter:
         damage: files found missing or changed when the session was opened; their steps count as not captured.
         recovered: whether the manifest was damaged and replaced by the one before the last step.
         again: captured steps to capture once more; each stays until its new captures are whole.
+        added: ids of the steps that this writer has stored.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class SessionWriter:
         self._lock = lock
         self._now = now
         self.again: frozenset[str] = frozenset()
+        self.added: set[str] = set()
         self._invalid = {item.step_id for item in damage}
 
     @classmethod
@@ -247,6 +249,7 @@ class SessionWriter:
         self._replace(manifest)
         self._invalid.discard(step_id)
         self.again -= {step_id, *without}
+        self.added.add(step_id)
         return step
 
     def drop(self, step_ids: Collection[str]) -> None:

@@ -85,7 +85,12 @@ def judge(
 ) -> tuple[Validation, Mapping[TermName, ZMap]]:
     """Validate, and keep the maps for figures; see ``validate``. ``progress`` gets each term when it begins."""
     check_same_rig(profile, session.rig, session.camera)
-    own = tuple(term for term in ORDER if _own(profile.result(term), session.steps(term)))
+    sha256 = sha256_file(session.path / MANIFEST_NAME)
+    own = tuple(
+        term
+        for term in ORDER
+        if _own(profile.result(term), session.steps(term), sha256 == profile.provenance.session_sha256)
+    )
 
     def one(term: TermName) -> Judged:
         progress(term)
@@ -109,7 +114,7 @@ def judge(
         advice=_advice(failed, own, tuple(dict.fromkeys(check.term for check in counted))),
         profile_created_at=profile.provenance.created_at,
         session_created_at=session.manifest.created_at,
-        session_sha256=sha256_file(session.path / MANIFEST_NAME),
+        session_sha256=sha256,
         own_terms=own,
         checks=checks,
         limits=limits,
@@ -148,9 +153,14 @@ def _not_counted(term: TermName, name: str, what: str) -> Judged:
     return Judged((Check(term, name, None, None, "", None, what),))
 
 
-def _own(result: FitResult, steps: Sequence[StoredStep]) -> bool:
-    """Whether a term was fitted to these captures; a session with other steps beside them has the same."""
-    return bool(steps) and result.captures is not None and result.captures.sha256 == captures_of(steps).sha256
+def _own(result: FitResult, steps: Sequence[StoredStep], same_session: bool) -> bool:
+    """Whether a term was fitted to these captures; where the profile does not name them, to this very session.
+
+    A session with other steps beside them has the same captures.
+    """
+    if not steps or result.captures is None:
+        return bool(steps) and same_session
+    return result.captures.sha256 == captures_of(steps).sha256
 
 
 def _advice(failed: tuple[TermName, ...], own: tuple[TermName, ...], counted: tuple[TermName, ...]) -> str:
@@ -164,6 +174,6 @@ def _advice(failed: tuple[TermName, ...], own: tuple[TermName, ...], counted: tu
             return "Go on with this profile: it predicts the session's captures."
         return (
             f"Go on with this profile: it predicts the session's captures of {' and '.join(others)}. Those of "
-            f"{' and '.join(own)} are the ones that it was fitted to, and confirm nothing."
+            f"{' and '.join(own)} are the ones that it was fitted to, and confirm little."
         )
     return "The profile describes the captures that it was fitted to; capture others to confirm it."

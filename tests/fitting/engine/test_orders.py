@@ -58,8 +58,8 @@ def test_a_quantity_stays_where_the_data_ask_for_it() -> None:
     found = Quantity.asked("spread", 5.0, 1.0, 1000)
     assert (found.value, found.there, found.candidates[1].name) == (5.0, True, "with spread")
     for value, gain in ((2.0, None), (-9.0, None), (9.0, 0.0)):
-        lost = Quantity.asked("spread", value, 1.0, 1000, gain, without=0.1)
-        assert (lost.value, lost.there) == (0.1, False)
+        lost = Quantity.asked("spread", value, 1.0, 1000, gain)
+        assert (lost.value, lost.there) == (0.0, False)
         assert lost.variance >= 1.0
         assert [candidate.chosen for candidate in lost.candidates] == [True, False]
 

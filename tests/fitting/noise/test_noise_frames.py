@@ -330,3 +330,13 @@ def test_dark_frames_that_dark_current_fills_are_left_out() -> None:
     result = measure(sensor, 21)
     assert any("dark exposures are left out" in note for note in result.notes)
     assert np.abs(errors_in_sigma(result, sensor)).max() < 4.5
+
+
+def test_a_dark_current_that_is_left_out_may_be_there_by_its_sigma() -> None:
+    """Where it is too weak to be asked for, its sigma is not that of a fit that has it."""
+    sensor, lost = replace(PLAIN, dark_e_per_s=0.28), 0
+    for seed in range(12):
+        found = measure(sensor, 400 + seed).estimate("dark_current_e_per_s")
+        assert abs(found.value - 0.28) < 2.5 * found.sigma
+        lost += found.value == 0
+    assert 3 <= lost <= 11

@@ -102,6 +102,15 @@ def test_mrcal_tells_the_difference_that_udccal_tells(tmp_path: Path, profile: P
         assert np.abs(ours - np.array(theirs)).max() < 0.01 * np.hypot(*ours.T).max()
 
 
+def test_the_lenses_differ_by_as_much_the_other_way_round(profile: Profile) -> None:
+    """By 20 px here: what is 1 % of the focal length to one profile is not quite that to the other."""
+    other = dataclasses.replace(LENS, focal_px=LENS.focal_px * 1.01, distortion=LENS.distortion * 2 + 0.01)
+    changed = dataclasses.replace(profile, geometry=fitted("geometry", other))
+    there, back = _rays(profile, changed)[1], _rays(changed, profile)[1]
+    assert np.abs(there).max() > 0.1
+    assert np.abs(there + back).max() < 1e-6 * np.abs(there).max()
+
+
 def test_it_comes_back_to_the_bit(tmp_path: Path, profile: Profile) -> None:
     lens = read_lens(write(profile, tmp_path / "a.cameramodel"), IMPORTS["mrcal"])
     for name in ("focal_px", "principal_point_px", "distortion"):

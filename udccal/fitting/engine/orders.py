@@ -162,9 +162,7 @@ class Quantity:
     candidates: tuple[Candidate, ...] = ()
 
     @classmethod
-    def asked(
-        cls, name: str, value: float, variance: float, samples: int, gain: float | None = None, without: float = 0.0
-    ) -> Quantity:
+    def asked(cls, name: str, value: float, variance: float, samples: int, gain: float | None = None) -> Quantity:
         """The value if it raises the likelihood (minus twice the logarithm) by more than BIC requires.
 
         The variance includes that the choice may be wrong (``Choice.spread``): a value that is there but too small to
@@ -175,10 +173,9 @@ class Quantity:
             value, variance: the estimate; without ``gain`` it cannot be negative.
             samples: number of data that determine it.
             gain: of the likelihood; by default that of a normal estimate, 0 for a value below 0.
-            without: the value where the data do not support it.
         """
         own = value**2 / variance if value > 0 and variance > 0 else 0.0
-        simple = Attempt(f"without {name}", 0, own if gain is None else gain, without)
+        simple = Attempt(f"without {name}", 0, own if gain is None else gain, 0.0)
         there = max(value, 0.0) if gain is None else value
         choice = choose((simple, Attempt(f"with {name}", 1, bic(0.0, 1.0, samples), there)))
         spread = float(choice.spread(samples, np.atleast_1d)[0, 0])

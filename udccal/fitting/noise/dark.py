@@ -1,4 +1,4 @@
-"""Dark frames: black, dark current, read noise and its shape, row noise and DSNU; each if the data support it."""
+"""Dark frames: black and read noise; dark current, row noise and DSNU, each if the data support it."""
 
 from __future__ import annotations
 
@@ -166,13 +166,15 @@ def _levels(
     cov = scaled_inverse(design.T @ (design / variances[:, None]))
     line = cov @ (design.T @ (means / variances))
     cov[1, 1] = cov[1, 1] if apart else (line[0] / max(float(times[0]), 1e-6)) ** 2
-    current = Quantity.asked("dark current", float(line[1]), float(cov[1, 1]), data.dark_samples)
+    own = float(cov[1, 1])
+    current = Quantity.asked("dark current", float(line[1]), own, data.dark_samples)
     if not fit.follows:
         # With coarse or cut-off codes, the errors of black, spread and noise are common to all pairs.
         cov[[0, 1], [0, 1]] = np.maximum(np.diag(cov), np.diag(fit.cov)[:2] * [len(data.darks), 1])
     if any(own == pair.step_DN**2 / 12.0 for own, pair in zip(fit.variances_DN2, data.darks, strict=True)):
         # Rounding hides the same in every exposure.
         cov[0, 0] += data.rounding_DN2
+    cov[1, 1] += current.variance - own
     # Black stays that of the line: a dark current too weak to be chosen must not shift it.
     return float(line[0]), cov, current
 

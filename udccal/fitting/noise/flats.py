@@ -264,7 +264,7 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
     # characteristic function f (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty. Tails leave
     # more of it than normal noise does; as much as Laplace's where the fitted shape has them.
     frequency = 2 * np.pi * np.arange(1, 8) / q
-    tails = dark.foreign or shape < 0
+    tails = dark.foreign or shape < -(dark.shape.variance**0.5)
     read = 1 / (1 + 0.5 * frequency**2 * V0) if tails else smeared(shape, frequency * np.sqrt(V0))
     left = read * np.exp(-0.5 * frequency**2 * (spread2 - V0))
     rounding = float(np.sum(2 * (left / frequency) ** 2))
