@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, Shaped
 from procedures.metering import spot_light
 from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame
+from udccal.fitting.geometry.corners import board_points_mm
 from udccal.guide.events import Outline, Reading
 from udccal.mounting import nominal_rotation
 from udccal.rig import RigDescription
@@ -180,8 +181,7 @@ def moved_px(one: CornersSeen, other: CornersSeen) -> float:
 def lean(seen: CornersSeen, spec: BoardSpec, rig: RigDescription) -> Reading:
     """Return the angle between a board and the panel, as a nominal camera sees it; 0 for a board on the jig."""
     mounting, turn_deg = rig.mounting, math.inf
-    down, across = np.divmod(seen.numbers, spec.columns - 1)
-    corners = np.stack([across + 1.0, down + 1.0, 0.0 * down], axis=1) * spec.square_mm
+    corners = board_points_mm(spec)[seen.numbers]
     # Corners in a line do not tell how a board lies.
     if len(corners) >= _FEWEST_CORNERS and np.linalg.matrix_rank(corners - corners.mean(axis=0)) == 2:
         camera = np.diag([rig.focal_px, rig.focal_px, 1.0])

@@ -75,12 +75,10 @@ def fit_dark_terms(
         row, unresolved = row_noise(data, np.zeros(len(data.darks)))[0], rounding
     else:
         unresolved = 0.0
+    fit = _with_drawn_rows(fit, data, in_pairs)
     if in_pairs > 0 and np.abs(gains - 1).max() > rules.white:
         # Rounding hides part of the row noise, and what is wrong with it is taken for read noise.
-        less = fitted(float(np.sqrt(max(in_pairs**2 - row.variance**0.5, 0.0))), fit.values).values
-    else:
-        less = fit.values
-    fit = _with_drawn_rows(fit, data, in_pairs).doubted(less)
+        fit = fit.doubted(fitted(float(np.sqrt(max(in_pairs**2 - row.variance**0.5, 0.0))), fit.values).values)
     shape = Quantity(float(fit.values[4]), float(fit.cov[4, 4]))
     # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
     white = fit.follows and 4 * np.pi**2 * float(fit.values[2]) >= rules.smeared * data.q_DN**2
@@ -166,15 +164,15 @@ def _levels(
     cov = scaled_inverse(design.T @ (design / variances[:, None]))
     line = cov @ (design.T @ (means / variances))
     cov[1, 1] = cov[1, 1] if apart else (line[0] / max(float(times[0]), 1e-6)) ** 2
-    own = float(cov[1, 1])
-    current = Quantity.asked("dark current", float(line[1]), own, data.dark_samples)
+    current = Quantity.asked("dark current", float(line[1]), float(cov[1, 1]), data.dark_samples)
+    by_choice = current.variance - float(cov[1, 1])
     if not fit.follows:
         # With coarse or cut-off codes, the errors of black, spread and noise are common to all pairs.
         cov[[0, 1], [0, 1]] = np.maximum(np.diag(cov), np.diag(fit.cov)[:2] * [len(data.darks), 1])
     if any(own == pair.step_DN**2 / 12.0 for own, pair in zip(fit.variances_DN2, data.darks, strict=True)):
         # Rounding hides the same in every exposure.
         cov[0, 0] += data.rounding_DN2
-    cov[1, 1] += current.variance - own
+    cov[1, 1] += by_choice
     # Black stays that of the line: a dark current too weak to be chosen must not shift it.
     return float(line[0]), cov, current
 
