@@ -44,8 +44,9 @@ def virtual_screen(*screens: str) -> Iterator[VirtualScreen]:
     listed = [word for index, size in enumerate(screens) for word in ("-screen", str(index), size)]
     said, told = os.pipe()
     with tempfile.TemporaryDirectory() as folder, os.fdopen(said) as names:
+        # A server that resets when its last client leaves refuses, for a moment, the one that comes next.
         process = subprocess.Popen(
-            ["Xvfb", "-displayfd", str(told), *listed, "-fbdir", folder, "-nolisten", "tcp"],
+            ["Xvfb", "-noreset", "-displayfd", str(told), *listed, "-fbdir", folder, "-nolisten", "tcp"],
             pass_fds=[told],
             stderr=subprocess.DEVNULL,
         )

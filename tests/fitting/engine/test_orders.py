@@ -78,3 +78,13 @@ def test_the_root_of_a_variance_that_is_lost_in_its_error_is_as_uncertain_as_tha
     assert Quantity(4.0, 0.01).root() == (2.0, 0.25)
     value, slope = Quantity(0.0, 1e-4).root()
     assert (value, slope * 1e-2) == (0.0, pytest.approx(0.1))
+
+
+def test_what_the_data_hardly_determine_keeps_the_doubt_of_the_orders_above() -> None:
+    """The order above finds its parameter at 0 by chance, to 3.0; the chosen one holds it at 0 exactly."""
+    choice = choose([Attempt("without", 0, 0.0, 0.0), Attempt("with", 1, bic(0.0, 1.0, 1000), 9.0)])
+    weight = np.exp(-1.0) / (1 + np.exp(-1.0))
+    assert choice.spread(1000, lambda own: np.zeros(1))[0, 0] == 0.0
+    assert choice.spread(1000, lambda own: np.zeros(1), cov=lambda own: np.full((1, 1), own))[0, 0] == pytest.approx(
+        9.0 * weight
+    )

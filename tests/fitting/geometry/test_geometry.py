@@ -7,7 +7,18 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fitting.geometry.boards import CAMERA, SIZE, SPEC, calibrated, draw, pose, true_corners
+from tests.fitting.geometry.boards import (
+    CAMERA,
+    SIZE,
+    SPEC,
+    VISIBLE_BEND,
+    WIDE,
+    calibrated,
+    draw,
+    pose,
+    sight,
+    true_corners,
+)
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
@@ -245,3 +256,17 @@ def test_a_session_of_drawn_boards(tmp_path: Path) -> None:
     assert abs(result.estimate("tilt_deg").value - TILT_DEG) < 0.2  # a sixth of the pixels across
     assert result.estimate("fx").value == pytest.approx(300.0, abs=1.0)
     np.testing.assert_allclose(result.term.pupil_mm, nominal_geometry(rig).pupil_mm)
+
+
+@pytest.mark.parametrize("seed", [0, 3, 6, 7, 10])
+def test_a_coefficient_that_boards_in_a_corner_do_not_determine_has_a_sigma_that_holds(seed: int) -> None:
+    """By chance the order above finds it near 0: a sigma by its distance from there alone was 19 times too small."""
+    scene = sight(seed=seed, quadrant=True, distance_mm=(1500.0, 2500.0))
+    data = GeometryData(
+        tuple(scene.views(np.random.default_rng(8 + seed))), replace(START, focal_px=np.full(2, 870.0)), WIDE
+    )
+    found = fit_boards(data)
+    assert found.status is FitStatus.CONVERGED
+    own = {estimate.name: estimate for estimate in found.estimates}
+    for name, true in zip(("p1", "p2"), VISIBLE_BEND[2:4], strict=True):
+        assert abs(own[name].value - true) < 4.5 * own[name].sigma

@@ -62,6 +62,7 @@ class Choice(Generic[Fit]):
         samples: int,
         values: Callable[[Fit], Float[np.ndarray, " values"]],
         against: Float[np.ndarray, " tried"] | float = 0.0,
+        cov: Callable[[Fit], Float[np.ndarray, "values values"]] | None = None,
     ) -> Float[np.ndarray, "values values"]:
         """Spread of values about the chosen order's, by Akaike's weights (Buckland et al., Biometrics 53, 1997).
 
@@ -71,12 +72,22 @@ class Choice(Generic[Fit]):
             samples: number of data of the criteria, which are those of ``bic``; an infinite one counts for nothing.
             values: of a fit, those whose spread is asked for.
             against: part of each criterion that is no cost of its parameters.
+            cov: of these values in one order. A parameter that the data hardly determine may be found near 0 by chance:
+                what the orders above the chosen one do not know of it is then added.
         """
         parameters = np.array([one.parameters for one in self.tried])
         akaike = np.array([one.criterion for one in self.tried]) - against - (np.log(max(samples, 2)) - 2) * parameters
         away = np.array([values(one.fit) for one in self.tried]) - values(self.best.fit)
         weight = np.exp(-0.5 * (akaike - akaike.min())) if np.isfinite(akaike.min()) else np.zeros(len(akaike))
-        return np.asarray((away.T * (weight / max(weight.sum(), 1.0))) @ away)
+        weight /= max(weight.sum(), 1.0)
+        found = np.asarray((away.T * weight) @ away)
+        if cov is not None:
+            own = cov(self.best.fit)
+            above = [
+                (w, one) for w, one in zip(weight, self.tried, strict=True) if one.parameters > self.best.parameters
+            ]
+            found = found + sum(w * (cov(one.fit) - own) for w, one in above)
+        return found
 
 
 def choose(tried: Iterable[Attempt[Fit]]) -> Choice[Fit]:

@@ -210,7 +210,7 @@ def _result(
     notes, held = bundle.notes, [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
     if held:
         zero = f"Held at 0, as the data do not ask for it: {', '.join(held)}."
-        notes = (*notes, f"{zero} The sigmas are those of a lens without it.")
+        notes = (*notes, f"{zero} Their sigmas say how far from 0 they may be.")
     priors = None if prior is None else priors_of(INTRINSIC_NAMES, prior.mean, prior.sigma)
     evidence = bundle.evidence
     diagnostics = (

@@ -272,4 +272,9 @@ def _choose_order(
     if known[:4].max() > rules.prior_share:
         return Choice(tried[-1], tuple(tried)), None
     orders = choose(tried)
-    return orders, orders.spread(samples, lambda of: np.append(of.place.intrinsics, of.place.poses), against)
+    return orders, orders.spread(
+        samples,
+        lambda of: np.append(of.place.intrinsics, of.place.poses),
+        against,
+        lambda of: of.equations.joint_cov(),
+    )
