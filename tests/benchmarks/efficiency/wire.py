@@ -101,7 +101,7 @@ def bounds(truth: Wire, built: WireStart, step: int) -> Bounds:
     unit = np.ones(10)
     unit[:3] = 180 / np.pi
     unit[3], unit[6] = float(truth.standoff_per_pitch), float(truth.footprint_per_pitch)
-    slopes = np.asarray(_map_slopes(at, truth, shape, places(), _grid(48, 64)))
+    slopes = np.asarray(_map_slopes(at, truth, shape_vector(truth), places(), _grid(48, 64)))
     return cramer_rao(information)[:10] * unit, cramer_rao(information, slopes)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,6 +118,7 @@ VISIBLE = {
     "no distortion": (0.0, 0.0, 0.0, 0.0, 0.0),
     "k1": (-0.07, 0.0, 0.0, 0.0, 0.0),
     "k1 k2": (-0.12, 0.2, 0.0, 0.0, 0.0),
+    "k1 k2 k3": (-0.12, 0.2, 0.0, 0.0, -0.25),
     "k1 k2 p1 p2": (-0.12, 0.2, 1e-3, -1e-3, 0.0),
     "k1 k2 p1 p2 k3": (-0.12, 0.2, 1e-3, -1e-3, -0.25),
 }
@@ -171,3 +173,21 @@ def test_sigmas_hold_where_small_coefficients_are_dropped() -> None:
         centre = np.array(found.intrinsics.principal_point_px)
         z.append((centre - scene.camera.principal_point_px) / np.sqrt(np.diag(found.cov)[2:4]))
     assert np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("far", [{}, {"quadrant": True, "distance_mm": (1500.0, 2500.0)}])
+def test_sigmas_hold_whether_a_lens_has_a_coefficient_or_not(far: dict[str, Any]) -> None:
+    """Half of the lenses have no p1 and p2, or no k3; of the others, many have small ones. Views are few or many."""
+    z = []
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 77])
+        tangential, last = rng.uniform(size=2) < 0.5
+        size = rng.choice([1.0, 0.3, 0.1], 2)
+        bend = [-0.07, 0.035, *rng.normal(0, 1e-3, 2) * tangential * size[0], rng.normal(0, 0.1) * last * size[1]]
+        scene = sight(seed=seed, views=int(rng.integers(5, 14)), distortion=np.array(bend), **far)
+        found = calibrated(*arrays(scene, seed)[:2], scene.size)
+        off = found.intrinsics.vector - Intrinsics.of_geometry(scene.camera).vector
+        z.append(off / np.sqrt(np.diag(found.cov)[: len(off)]))
+    assert np.abs(z).max() < 4.5
+    assert (np.sqrt(np.mean(np.square(z), axis=0)) < 1.4).all()

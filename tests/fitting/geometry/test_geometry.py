@@ -144,7 +144,7 @@ def test_the_outlier_is_left_out_and_named(fitted: FitResult[Geometry]) -> None:
 
 def test_the_order_of_the_distortion_is_chosen_by_bic(fitted: FitResult[Geometry]) -> None:
     chosen = [c for c in fitted.candidates if c.chosen]
-    assert len(fitted.candidates) == 5
+    assert len(fitted.candidates) == 6
     assert chosen == [min(fitted.candidates, key=lambda c: c.criterion)]
     assert "p1" in chosen[0].name
 

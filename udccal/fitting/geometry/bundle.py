@@ -22,10 +22,10 @@ from udccal.models.geometry import Geometry
 
 INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 LENS = len(INTRINSIC_NAMES)
-# Orders of the distortion, simplest first: which intrinsics are free. Each includes the coefficients of the one before.
+# Orders of the distortion, simplest first: which intrinsics are free. The last one includes all others.
 ORDERS = {
-    name: np.arange(LENS) < count
-    for name, count in (("no distortion", 4), ("k1", 5), ("k1 k2", 6), ("k1 k2 p1 p2", 8), ("k1 k2 p1 p2 k3", 9))
+    name: np.array([own in ("fx", "fy", "cx", "cy", *name.split()) for own in INTRINSIC_NAMES])
+    for name in ("no distortion", "k1", "k1 k2", "k1 k2 k3", "k1 k2 p1 p2", "k1 k2 p1 p2 k3")
 }
 EVERY = np.ones(LENS, dtype=bool)
 NOTHING_KNOWN = Prior(np.zeros(LENS), np.zeros((0, LENS)))

@@ -249,7 +249,7 @@ def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"
 def _choose_order(
     full: _Fitted, prior: Prior, rules: GeometryRules
 ) -> tuple[Choice[Solved], Float[np.ndarray, "n n"] | None]:
-    """Every order, each solved from the one above with its further coefficients at 0, and what the choice adds to cov.
+    """Every order, each solved from the one before with other coefficients at 0, and what the choice adds to cov.
 
     Where a large part of the information on focal length or centre is the prior's, the data are too few to separate a
     coefficient from a pose. All coefficients then stay free, each within its prior, and there is no choice (None).
@@ -259,7 +259,8 @@ def _choose_order(
     """
     points, solved, tried = full.points, full.solved, list[Attempt[Solved]]()
     samples, rounding = 2 * int(points.used.sum()), float(((1e-7 / points.sigma[points.used]) ** 2).sum())
-    against = 2 * np.log(rules.further_order) * np.arange(len(ORDERS))
+    # p1 and p2 come together.
+    against = 2 * np.log(rules.further_order) * np.array([sum(free[[4, 5, 6, 8]]) for free in ORDERS.values()])
     for price, (name, free) in reversed(list(zip(against, ORDERS.items(), strict=True))):
         if tried:
             above = Bundle(np.where(free, solved.place.intrinsics, 0.0), solved.place.poses)
