@@ -22,7 +22,7 @@ from udccal.models.wire import Wire
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import write_profile
-from udccal.result import FitResult, FitStatus, TermResults
+from udccal.result import FitResult, TermResults
 from udccal.rig import RigDescription
 from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
@@ -99,11 +99,6 @@ class Calibration(TermResults):
         for result in self.results:
             result.or_raise()
         return self
-
-    @property
-    def not_captured(self) -> tuple[TermName, ...]:
-        """The terms that the session has no captures of."""
-        return tuple(term for term in ORDER if self.result(term).status is FitStatus.NOT_CAPTURED)
 
     def write(self, path: str | Path) -> Path:
         """Write the profile as a folder, or as one file if ``path`` ends in ``.zip``; replace a profile at ``path``.
