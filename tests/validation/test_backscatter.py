@@ -37,13 +37,29 @@ def test_a_panel_at_90_percent_fails(true: World, data: BackscatterData) -> None
     brighter = replace(true.term, mask=np.asarray(true.term.mask) / 0.9)
     found = judge_backscatter(data, fitted("backscatter", brighter), ValidationLimits())
     assert "panel's brightness" in failed(found)
+    assert named(found, "pattern over the sensor").value == 0.0
     assert named(found, "panel's brightness").value == pytest.approx(10.0, abs=0.5)
 
 
 def test_a_camera_elsewhere_on_the_panel_fails(true: World, data: BackscatterData) -> None:
     moved = replace(true.term, emitters_px=np.asarray(true.term.emitters_px) + np.array([3.0, 0.0]))
     found = judge_backscatter(data, fitted("backscatter", moved), ValidationLimits())
-    assert {"panel's light, RMS, of its peak", "chi-squared"} <= failed(found)
+    assert {"panel's light, RMS, of its peak", "pattern over the sensor", "chi-squared"} <= failed(found)
+
+
+@pytest.mark.parametrize("seed", range(4, 8))
+def test_the_same_light_in_other_noise_has_no_pattern(true: World, seed: int) -> None:
+    again = shots_of(true, np.random.default_rng(seed), panel_pictures(true.rig, seed, 3))
+    found = judge_backscatter(again, fitted("backscatter", true.term), ValidationLimits())
+    assert not failed(found)
+    assert named(found, "pattern over the sensor").value == 0.0
+
+
+def test_another_shading_leaves_a_pattern(true: World, data: BackscatterData) -> None:
+    mask = np.asarray(true.term.mask)
+    shaded = replace(true.term, mask=mask * (1 + 0.03 * np.linspace(-1, 1, mask.shape[2])))
+    found = judge_backscatter(data, fitted("backscatter", shaded), ValidationLimits())
+    assert {"pattern over the sensor"} <= failed(found) <= {"pattern over the sensor", "chi-squared"}
 
 
 def test_a_session_without_white_cannot_be_judged(true: World, data: BackscatterData) -> None:

@@ -37,3 +37,12 @@ def test_a_pattern_is_found_and_chance_is_not() -> None:
     test, size = one.pattern(group)
     assert test.found
     assert size == pytest.approx(0.5, abs=0.2)
+
+
+def test_a_group_that_was_solved_for_tells_nothing() -> None:
+    """Of three groups, the parameters of the capture have removed one, or all."""
+    group, z = np.arange(3), np.array([0.0, 9.0, -9.0])
+    test, size = Prediction(z, np.eye(3)[:, :1], np.zeros((3, 0))).pattern(group)
+    assert test.found
+    assert size == pytest.approx(np.sqrt(160 / 3))
+    assert Prediction(0 * z, np.eye(3), np.zeros((3, 0))).pattern(group)[1] == 0.0

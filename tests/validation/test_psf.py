@@ -47,7 +47,23 @@ def test_the_same_kernels_spots_are_predicted(term: PsfField, data: PsfData) -> 
 def test_a_defocused_kernel_fails(term: PsfField, data: PsfData) -> None:
     soft = replace(term, diffraction=replace(term.diffraction, blur_px=np.float64(0.8)))
     found = judge_psf(data, result_of(soft), ValidationLimits(), own=False)
-    assert {"LED's picture, L2", "chi-squared"} <= failed(found)
+    assert {"LED's picture, L2", "pattern of the LEDs' pictures", "chi-squared"} <= failed(found)
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_the_same_spots_in_other_noise_have_no_pattern(term: PsfField, seed: int) -> None:
+    scene, rng = small_scene((2, 2), 2), np.random.default_rng(seed)
+    again = pictures(scene, pack(term.diffraction), rng)
+    found = judge_psf(PsfData(shots_of(scene, again, rng), len(again)), result_of(term), ValidationLimits(), own=False)
+    assert not failed(found)
+    assert (named(found, "pattern of the LEDs' pictures").value or 0.0) < 0.5
+
+
+def test_wider_openings_leave_a_pattern(term: PsfField, data: PsfData) -> None:
+    wider = replace(term.diffraction, openings=np.asarray(term.diffraction.openings) + np.array([0.0, 0.02]))
+    found = judge_psf(data, result_of(replace(term, diffraction=wider)), ValidationLimits(), own=False)
+    assert "pattern of the LEDs' pictures" in failed(found)
+    assert "a pattern of" in named(found, "pattern of the LEDs' pictures").what
 
 
 def test_of_the_profiles_own_session_only_held_out_positions_count(term: PsfField, data: PsfData) -> None:

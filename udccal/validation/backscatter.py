@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays, read_backscatter
 from udccal.fitting.backscatter.model import PerShot, Usable, ratios
-from udccal.fitting.backscatter.parameters import linear_of, vector_of
+from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, vector_of
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
@@ -18,6 +18,7 @@ from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Check, Judged, ZMap, at_most, chi2_check, unusable
 from udccal.validation.limits import ValidationLimits
+from udccal.validation.patterns import Samples, pattern_check
 
 # Every so many bins of the term's grid, down and across, are predicted.
 _EVERY = 4
@@ -37,7 +38,7 @@ def validate_backscatter(profile: Profile, session: Session, limits: ValidationL
 
 @in_float64
 def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], limits: ValidationLimits) -> Judged:
-    """Judge the panel's brightness, the light of its pictures, and the scatter of the bins."""
+    """Judge the panel's brightness, the light of its pictures, patterns in it, and the scatter of the bins."""
     if (why := unusable_pictures(data, result.term)) is not None:
         return unusable("backscatter", why)
     seen = SeenLight.of(data, result.term, result.diagnostic("model_error_of_white") or 0.0)
@@ -46,6 +47,7 @@ def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], lim
     checks = (
         _brightness(seen, limits),
         _light_check(seen, limits),
+        _pattern_check(seen, limits),
         chi2_check(
             "backscatter",
             float(np.sum(seen.z**2)) / count,
@@ -159,3 +161,32 @@ def _light_check(seen: SeenLight, limits: ValidationLimits) -> Check:
         "%",
         f"The light of {len(seen.off)} pictures is off by up to {worst:.2f} % of its peak (RMS, without noise).",
     )
+
+
+def _pattern_check(seen: SeenLight, limits: ValidationLimits) -> Check:
+    """Parts of the sensor that see another light than the rest; the panel's brightness is solved for."""
+    light = seen.light * brightness(seen)[:, None]
+    peak = np.maximum(np.maximum(light, seen.light + seen.off).max(axis=(1, 2), keepdims=True), 1e-9)
+    used, shots = seen.usable, seen.light.size // seen.light.shape[2]
+    parts, count = _parts(seen.shape, BackscatterRules().cells)
+    group = np.arange(shots).reshape(*seen.light.shape[:2], 1) * count + parts
+    off, noise, model = (seen.off + seen.light - light) / peak, seen.noise / peak**2, np.sqrt(seen.model) / peak
+    return pattern_check(
+        "backscatter",
+        "pattern over the sensor",
+        [Samples(off[used], noise[used], model[used], 0 * group[used]).pattern(group[used])],
+        100.0,
+        limits.panel_pattern_percent,
+        "%",
+        "Parts of the sensor in the panel's pictures, at the panel's own brightness,",
+    )
+
+
+def _parts(shape: tuple[int, int], most: int) -> tuple[Int[np.ndarray, " n"], int]:
+    """Return the part of the sensor in which each bin of a map lies, and how many parts there are.
+
+    There are at most ``most`` parts a side, of two bins a side or more where the map has them.
+    """
+    down, across = (int(np.clip(size // 2, 1, most)) for size in shape)
+    y, x = (np.arange(size) * n // size for size, n in zip(shape, (down, across), strict=True))
+    return (y[:, None] * across + x).ravel(), down * across

@@ -23,8 +23,10 @@ class ValidationLimits:
         wire_percent: of a pattern in flats that are divided by the wire map, RMS over the sensor.
         cell_percent: of such a flat's worst cell: a smudge, dust, or a changed shading.
         kernel_percent: of an LED's picture, relative L2, worst colour.
+        kernel_pattern_percent: of what LEDs' pictures share beyond noise, RMS relative to their light.
         backscatter_percent: of the panel's light, RMS over the sensor, of its peak, worst picture.
         panel_percent: of the panel's brightness, worst colour.
+        panel_pattern_percent: of a pattern over the sensor in the panel's light, RMS, of each picture's peak.
     """
 
     chance: float = 1e-3
@@ -37,5 +39,7 @@ class ValidationLimits:
     wire_percent: float = 0.2
     cell_percent: float = 1.0
     kernel_percent: float = 3.0
+    kernel_pattern_percent: float = 1.5
     backscatter_percent: float = 2.0
     panel_percent: float = 2.0
+    panel_pattern_percent: float = 0.5

@@ -21,7 +21,9 @@ from udccal.profiles.profile import Profile
 from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Check, Judged, ZMap, at_most, chi2_check, unusable
+from udccal.validation.dark import bend_check, dark_pattern_check
 from udccal.validation.limits import ValidationLimits
+from udccal.validation.patterns import Pattern, pattern_check
 from udccal.validation.prediction import Prediction
 
 # What the photon transfer depends on; derivatives are over this part of each number.
@@ -41,7 +43,7 @@ def validate_noise(profile: Profile, session: Session, limits: ValidationLimits)
 
 
 def judge_noise(data: NoiseData, result: FitResult[Noise], limits: ValidationLimits) -> Judged:
-    """Judge black level, dark current, gain, and the scatter of variances, by a profile's noise."""
+    """Judge black level, dark current, gain, patterns of dark frames and variances, and the scatter of these."""
     seen = reduced(data, NoiseRules())
     if seen is None:
         return unusable("noise", "There are no pairs of dark and bright frames. Capture the noise steps again.")
@@ -55,6 +57,8 @@ def judge_noise(data: NoiseData, result: FitResult[Noise], limits: ValidationLim
     own = result.chi2_dof
     checks = (
         *_dark_checks(seen, result.term, limits),
+        bend_check(seen, result.term, limits),
+        dark_pattern_check(seen, result.term, limits),
         at_most(
             "noise",
             "gain",
@@ -62,6 +66,15 @@ def judge_noise(data: NoiseData, result: FitResult[Noise], limits: ValidationLim
             max(limits.K_percent, 100 * explained),
             "%",
             f"The variance of flats grows with their mean {gain:.4f} times as fast as the profile says.",
+        ),
+        pattern_check(
+            "noise",
+            "pattern of variances",
+            transfer.patterns(),
+            100.0,
+            limits.K_percent,
+            "%",
+            "Variances of flats, by exposure and by part of the sensor, at their own gain,",
         ),
         chi2_check("noise", found.chi2 / found.dof, found.dof, own, limits.chi2_factor, limits, "Variances of flats"),
     )
@@ -114,14 +127,31 @@ class _Transfer:
         ]
         return Prediction(z, np.zeros((len(z), 0)), np.transpose(slopes) @ square_root(self.cov))
 
+    def patterns(self) -> tuple[Pattern, Pattern]:
+        """What bins of a flat share, and what flats share in a bin, relative to the variance; the gain is free."""
+        found, expected = self.prediction(), np.maximum(self.predicted(self.values), 1e-9)
+        sigma = np.sqrt(2 / self.dof[self.usable])
+        along = (expected - self._floor) / expected / sigma
+        own = (along / max(float(np.linalg.norm(along)), 1e-300))[:, None]
+        free = Prediction(found.z - own @ (own.T @ found.z), own, found.by_profile)
+        flat, part = np.nonzero(self.usable)
+        unit2 = float(np.mean(sigma**2))
+        by_flat, by_part = (free.pattern(group) for group in (flat, part))
+        return Pattern(by_flat[0], by_flat[1] ** 2 * unit2), Pattern(by_part[0], by_part[1] ** 2 * unit2)
+
+    @property
+    def _floor(self) -> float:
+        """Variance at no light in DN^2, without row noise."""
+        K, _, sigma_d, row, _ = self.values
+        return float((K * sigma_d) ** 2 - row**2 + self.rounding)
+
     def gain(self) -> tuple[float, float]:
         """The gain by these flats over the profile's, by weighted least squares; and its sigma, by both errors."""
-        expected, (K, _, sigma_d, row, _) = self.predicted(self.values), self.values
-        floor = (K * sigma_d) ** 2 - row**2 + self.rounding
+        expected, floor = self.predicted(self.values), self._floor
         light, weight = expected - floor, self.dof[self.usable] / np.maximum(expected, 1e-9) ** 2 / 2
         information = float(np.sum(weight * light**2))
         ratio = float(np.sum(weight * light * (self.variance[self.usable] - floor)) / information)
-        return ratio, float(np.hypot(information**-0.5, self.cov[0, 0] ** 0.5 / K))
+        return ratio, float(np.hypot(information**-0.5, self.cov[0, 0] ** 0.5 / self.values[0]))
 
 
 def transfer_numbers(result: FitResult[Noise]) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "5 5"]]:

@@ -11,6 +11,9 @@ from jaxtyping import Float, Int
 from udccal.comparison.estimates import chi2_of
 from udccal.fitting.engine.misfit import MisfitTest, chi2_test
 
+# Part of a group's variance below which it is an error of rounding.
+_LEAST = 1e-9
+
 
 @final
 @dataclass(frozen=True)
@@ -50,9 +53,11 @@ class Prediction:
         count, sums = inside.sum(axis=1), inside @ self.z
         removed, moved = inside @ self.own, inside @ self._by_profile()
         cov = np.diag(count) - removed @ removed.T + moved @ moved.T
-        statistic, dof = chi2_of(sums, cov)
+        # A group of which parameters of the capture have removed all tells nothing.
+        told = np.diag(cov) > _LEAST * count
+        statistic, dof = chi2_of(sums[told], cov[np.ix_(told, told)])
         test = chi2_test(statistic, float(dof))
-        excess = float(((sums**2 - np.diag(cov)) / count).sum() / count.sum())
+        excess = float(((sums**2 - np.diag(cov)) / count)[told].sum() / count.sum())
         return test, float(np.sqrt(max(excess, 0.0))) if test.found else 0.0
 
     def _by_profile(self) -> Float[np.ndarray, "n k"]:

@@ -22,6 +22,7 @@ from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Check, Judged, ZMap, at_most, chi2_check, unusable
 from udccal.validation.limits import ValidationLimits
+from udccal.validation.patterns import Samples, pattern_check
 
 # Pictures of a place that are predicted.
 _PICTURES = 2
@@ -38,7 +39,7 @@ def validate_psf(profile: Profile, session: Session, limits: ValidationLimits, o
 
 @in_float64
 def judge_psf(data: PsfData, result: FitResult[PsfField], limits: ValidationLimits, own: bool) -> Judged:
-    """Judge the relative L2 error of the LEDs' pictures, and their chi-squared.
+    """Judge the relative L2 error of the LEDs' pictures, patterns in it, and their chi-squared.
 
     Of the profile's ``own`` session, only the positions count that its fit held out.
     """
@@ -68,6 +69,7 @@ def judge_psf(data: PsfData, result: FitResult[PsfField], limits: ValidationLimi
             f"Pictures of {shots.count} LEDs at {shots.positions} places differ from the predicted spots by "
             f"{100 * float(colours[worst]):.2f} % of their light (L2, {('red', 'green', 'blue')[worst]}).",
         ),
+        _pattern_check(found, shots, model_error, limits),
         chi2_check(
             "psf",
             float(HUBER.loss(z[found.known]).sum()) / count,
@@ -81,6 +83,36 @@ def judge_psf(data: PsfData, result: FitResult[PsfField], limits: ValidationLimi
     caption = "Pictures of LEDs, seen less predicted, mean over all of them about the LED's middle, in sigma."
     seen = np.maximum(found.known.sum(axis=0), 1)
     return Judged(checks, ZMap(z.sum(axis=0) / np.sqrt(seen), "x [px]", "y [px]", caption))
+
+
+def _pattern_check(found: Compared, shots: Shots, model_error: float, limits: ValidationLimits) -> Check:
+    """What all LEDs' pictures share in rings, rows or columns about the LED, and what those of a place share."""
+    here, model = found.known, model_error * found.left_out
+    # All pictures have the same kernel, and so about the same model error in a sample at the same place about the LED.
+    place = np.broadcast_to(np.arange(here[0].size).reshape(here.shape[1:]), here.shape)
+    samples = Samples(found.residual[here], found.variance[here], model[here], place[here])
+    light = float(np.sqrt(np.mean(found.light[here] ** 2)))
+    return pattern_check(
+        "psf",
+        "pattern of the LEDs' pictures",
+        [samples.pattern(np.broadcast_to(group, here.shape)[here]) for group in _groups(shots, found.channel)],
+        100 / max(light, 1e-30),
+        limits.kernel_pattern_percent,
+        "%",
+        "Rings, rows, columns and places of the LEDs' pictures",
+    )
+
+
+def _groups(
+    shots: Shots, channel: Int[np.ndarray, "shots rows columns"]
+) -> tuple[Int[np.ndarray, "shots rows columns"], ...]:
+    """Numbers of each sample's ring, row and column about the LED, and of its ring at its place; all by colour."""
+    x, y = np.moveaxis(shots.offsets(), -1, 0)
+    radius = np.hypot(x, y)
+    # At a place, few samples share a pixel: rings double their radius there.
+    wide = np.log2(1 + radius).astype(np.int64)
+    at_place = shots.position[:, None, None] * (wide.max() + 1) + wide
+    return tuple(3 * part + channel for part in (np.rint(radius).astype(np.int64), y - y.min(), x - x.min(), at_place))
 
 
 def _some(shots: Shots) -> Int[np.ndarray, " some"]:
