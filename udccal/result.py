@@ -114,6 +114,7 @@ class Captures:
         gain_dB: lowest and highest.
         completed_at: of the first and of the last step, in ISO 8601.
         temperature_C: lowest and highest of the sensor; None where the session has none.
+        steps: digest of each step, sorted (``sessions.evidence.step_digest``); None where they are not known.
     """
 
     sha256: str
@@ -122,6 +123,7 @@ class Captures:
     gain_dB: tuple[float, float]
     completed_at: tuple[str, str]
     temperature_C: tuple[float, float] | None = None
+    steps: tuple[str, ...] | None = None
 
 
 @final

@@ -45,7 +45,14 @@ def fitted(
         notes=("One frame was left out.",),
         outliers=(Outliers("frames that differ", 3, ("flat 2", "flat 7")),),
         residuals=ResidualSample(np.array([[0.5, 2.0], [95.0, 63.0]]), np.array([-1.5, 0.25])),
-        captures=Captures("cd" * 32, 4, 60, (0.0, 6.0), ("2026-01-02T03:04:05+00:00", "2026-01-02T03:14:05+00:00")),
+        captures=Captures(
+            sha256="cd" * 32,
+            files=4,
+            frames=60,
+            gain_dB=(0.0, 6.0),
+            completed_at=("2026-01-02T03:04:05+00:00", "2026-01-02T03:14:05+00:00"),
+            steps=("ab" * 8, "cd" * 8),
+        ),
         effort="quick",
     )
 

@@ -2,7 +2,8 @@
 
 ``stored/version_3.zip`` is the calibration of a simulated rig of 96 x 72 pixels by the command of its time, without a
 board; one in so many residuals is kept. The udccal of version 4 has read it, given the psf's blur a growth and colours,
-and written ``stored/version_4.zip``.
+and written ``stored/version_4.zip``; that of version 5 has read this one, given the response a bend, and written
+``stored/version_5.zip``.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from udccal.profiles.store import read_profile, write_profile
 from udccal.profiles.versions import JsonObject
 from udccal.result import FitStatus
 
-STORED: Final = {version: Path(__file__).parent / "stored" / f"version_{version}.zip" for version in (3, 4)}
+STORED: Final = {version: Path(__file__).parent / "stored" / f"version_{version}.zip" for version in (3, 4, 5)}
 # Of psf parameters, those that version 4 added.
 BLUR: Final = ("blur_growth", "blur_colour")
 
@@ -111,7 +112,10 @@ def test_where_it_comes_from_survives(document: JsonObject, profile: Profile) ->
 
 
 def test_what_came_later_is_as_it_was_meant_before(version: int, document: JsonObject, profile: Profile) -> None:
-    assert profile.noise.term.nonlinearity == 0.0
+    assert profile.noise.term.nonlinearity == (0.015625 if version >= 5 else 0.0)
+    captures = [profile.result(name).captures for name in TERMS]
+    assert sum(one is not None for one in captures) >= 4
+    assert {one.steps for one in captures if one is not None} == {None}
     stored = {one["name"] for one in document["terms"]["psf"]["parameters"]}
     assert (version >= 4) == all(f"diffraction.{name}" in stored for name in BLUR)
     growth, colour = ([0.125, -0.0625], [0.03125, 0.0, -0.015625]) if version >= 4 else (np.zeros(2), np.zeros(3))
@@ -166,7 +170,7 @@ def without(term: str, name: str) -> Callable[[JsonObject], object]:
 CHANGED: Final[dict[str, tuple[Callable[[JsonObject], object], str]]] = {
     "a future version": (lambda d: d.update(version=VERSION + 1), f"newer version {VERSION + 1}"),
     "a version without a number": (lambda d: d.update(version=None), "version number"),
-    "a later version than it is": (lambda d: d.update(version=VERSION), "nonlinearity"),
+    "a later version than it is": (lambda d: d.update(version=VERSION), "nonlinearity|captures.steps"),
     "no term": (lambda d: d["terms"].pop("psf"), "'terms.psf'"),
     "no fit": (lambda d: d["terms"]["wire"].pop("fit"), "'terms.wire.fit'"),
     "no captures": (lambda d: d["terms"]["noise"]["fit"].pop("captures"), "captures"),

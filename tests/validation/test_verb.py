@@ -53,7 +53,7 @@ def test_another_day_is_predicted_and_terms_without_captures_are_not_counted(fol
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert document == json.loads((out / "validation.json").read_text(encoding="utf-8"))
-    assert (document["ok"], document["own_terms"]) == (True, [])
+    assert (document["ok"], document["own_terms"], document["partly_own_terms"]) == (True, [], [])
     for check in document["checks"]:
         assert list(check) == ["term", "name", "value", "limit", "unit", "ok", "what"]
         assert check["what"].endswith(".")
@@ -114,6 +114,22 @@ def test_captures_stay_the_profiles_own_where_the_session_gains_others(folder: P
         session = udccal.capture(more, bench, terms=("noise", "wire"))
     assert len(session.steps("wire"))
     assert udccal.validate(profile, session).own_terms == ("noise",)
+
+
+def test_a_session_with_one_step_captured_again_is_partly_the_profiles_own(folder: Path) -> None:
+    profile = load_profile(folder / "profile")
+    first, second = (udccal.Session.open(folder / day) for day in ("first", "second"))
+    taken, other = first.steps("noise"), second.steps("noise")
+    mixed = first.manifest.model_copy(update={"steps": (*taken[:-1], other[-1])})
+    shutil.copytree(folder / "first", folder / "mixed")
+    for capture in other[-1].captures:
+        shutil.copy(second.path / capture.file, folder / "mixed" / capture.file)
+    found = udccal.validate(profile, udccal.Session(folder / "mixed", mixed))
+    assert (found.own_terms, found.partly_own_terms) == ((), ("noise",))
+    (note,) = (check for check in found.checks if check.name == "captures of the profile's fit")
+    assert f"fitted to {len(taken) - 1} of the {len(taken)} steps" in note.what
+    assert note.ok is None
+    assert "at least in part" in found.advice
 
 
 def test_a_term_without_its_dark_frames_is_not_counted(folder: Path) -> None:

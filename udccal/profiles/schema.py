@@ -11,7 +11,7 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import Sha256, StoredCamera
 
 FORMAT: Final = "udccal-profile"
-VERSION: Final = 5
+VERSION: Final = 6
 # Arrays of at most this many values are stored in profile.json, where a person can read and compare them.
 INLINE_VALUES = 512
 
@@ -159,6 +159,9 @@ class StoredDiagnostic(_Strict):
     unit: Unit
 
 
+StepDigest = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+
+
 class StoredOutliers(_Strict):
     """Samples left out by a rule: how many, and the first of their places."""
 
@@ -168,7 +171,10 @@ class StoredOutliers(_Strict):
 
 
 class StoredCaptures(_Strict):
-    """The captures that a fit used; ``sha256`` is of the sorted checksums of their files, one a line."""
+    """The captures that a fit used; ``sha256`` is of the sorted checksums of their files, one a line.
+
+    ``steps`` has the first digits of the same digest of each step alone.
+    """
 
     sha256: Sha256
     files: Annotated[int, Field(ge=1, le=2**32)]
@@ -176,6 +182,7 @@ class StoredCaptures(_Strict):
     gain_dB: Annotated[tuple[Decibel, Decibel], AfterValidator(_rising)]
     completed_at: tuple[Annotated[str, Field(max_length=40)], Annotated[str, Field(max_length=40)]]
     temperature_C: Annotated[tuple[Celsius, Celsius], AfterValidator(_rising)] | None
+    steps: Annotated[tuple[StepDigest, ...], Field(min_length=1, max_length=20000)] | None
 
 
 class StoredFit(_Strict):
@@ -241,7 +248,7 @@ class StoredProfile(_Strict):
     """The whole of ``profile.json``."""
 
     format: Literal["udccal-profile"]
-    version: Literal[5]
+    version: Literal[6]
     rig: RigDescription
     lineage: Lineage
     provenance: Provenance

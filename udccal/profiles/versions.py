@@ -133,12 +133,28 @@ def _fourth_to_fifth(found: JsonObject) -> JsonObject:
     return {**found, "version": 5, "terms": terms}
 
 
+def _fifth_to_sixth(found: JsonObject) -> JsonObject:
+    """Say that it is not known which steps each fit used: one digest of all of them was kept."""
+    terms = found.get("terms")
+    if isinstance(terms, dict):
+        terms = {name: _sixth_section(section) for name, section in terms.items()}
+    return {**found, "version": 6, "terms": terms}
+
+
+def _sixth_section(section: Any) -> Any:
+    fit = section.get("fit") if isinstance(section, dict) else None
+    if not isinstance(fit, dict) or not isinstance(fit.get("captures"), dict):
+        return section
+    return {**section, "fit": {**fit, "captures": {**fit["captures"], "steps": None}}}
+
+
 # By the version that a function starts from; it returns the next version.
 MIGRATIONS: Mapping[int, Migration] = {
     1: _first_to_second,
     2: _second_to_third,
     3: _third_to_fourth,
     4: _fourth_to_fifth,
+    5: _fifth_to_sixth,
 }
 
 

@@ -25,12 +25,17 @@ def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> Validat
             _counted(found.checks),
             Fact("profile made", found.profile_created_at),
             Fact("session begun", found.session_created_at),
-            Fact(
-                "session", f"the profile's own for {', '.join(found.own_terms)}" if found.own_terms else "another one"
-            ),
+            Fact("session", _whose(found)),
         ),
         sections=_sections(found.checks, maps),
     )
+
+
+def _whose(found: Validation) -> str:
+    """Whether the profile was fitted to the session."""
+    named = (("", found.own_terms), ("partly ", found.partly_own_terms))
+    own = [f"{how}the profile's own for {', '.join(terms)}" for how, terms in named if terms]
+    return "; ".join(own) or "another one"
 
 
 def comparison_page(found: SessionComparison, maps: Mapping[TermName, ZMap]) -> ValidationPage:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 from udccal.comparison.comparable import check_same_rig
@@ -12,16 +12,16 @@ from udccal.comparison.estimates import ORDER
 from udccal.errors import MissingStepError, SessionError
 from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile
-from udccal.result import FitResult, FitStatus
-from udccal.sessions.evidence import captures_of
+from udccal.result import FitStatus
 from udccal.sessions.manifest import MANIFEST_NAME
-from udccal.sessions.schema import StoredStep, TermName
+from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 from udccal.validation.backscatter import validate_backscatter
 from udccal.validation.checks import Check, Judged, ZMap
 from udccal.validation.geometry import validate_geometry
 from udccal.validation.limits import ValidationLimits
 from udccal.validation.noise import validate_noise
+from udccal.validation.own import Fitted, fitted_steps
 from udccal.validation.psf import validate_psf
 from udccal.validation.wire import validate_wire
 
@@ -39,6 +39,7 @@ class Validation:
         ok: whether every check that counts is within its limit.
         advice: one sentence that says what to do.
         own_terms: those that the profile fitted to these very captures: most of them then confirm nothing.
+        partly_own_terms: those that the profile fitted to some of these captures, which confirm little.
         checks: of all terms, in their order.
     """
 
@@ -51,6 +52,7 @@ class Validation:
     session_created_at: str
     session_sha256: str
     own_terms: tuple[TermName, ...]
+    partly_own_terms: tuple[TermName, ...]
     checks: tuple[Check, ...]
     limits: ValidationLimits
 
@@ -86,15 +88,13 @@ def judge(
     """Validate, and keep the maps for figures; see ``validate``. ``progress`` gets each term when it begins."""
     check_same_rig(profile, session.rig, session.camera)
     sha256 = sha256_file(session.path / MANIFEST_NAME)
-    own = tuple(
-        term
-        for term in ORDER
-        if _own(profile.result(term), session.steps(term), sha256 == profile.provenance.session_sha256)
-    )
+    same_session = sha256 == profile.provenance.session_sha256
+    fitted = {term: fitted_steps(profile.result(term), session.steps(term), same_session) for term in ORDER}
+    own, partly = (tuple(t for t in ORDER if getattr(fitted[t], name)) for name in ("whole", "partly"))
 
     def one(term: TermName) -> Judged:
         progress(term)
-        return _judged(term, profile, session, limits, term in own)
+        return _judged(term, profile, session, limits, fitted[term])
 
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         judged = dict(zip(ORDER, pool.map(one, ORDER), strict=True))
@@ -111,18 +111,19 @@ def judge(
         version=VERSION,
         rig=profile.rig.name,
         ok=not failed,
-        advice=_advice(failed, own, tuple(dict.fromkeys(check.term for check in counted))),
+        advice=_advice(failed, own, partly, tuple(dict.fromkeys(check.term for check in counted))),
         profile_created_at=profile.provenance.created_at,
         session_created_at=session.manifest.created_at,
         session_sha256=sha256,
         own_terms=own,
+        partly_own_terms=partly,
         checks=checks,
         limits=limits,
     )
     return answer, {term: one.z_map for term, one in judged.items() if one.z_map is not None}
 
 
-def _judged(term: TermName, profile: Profile, session: Session, limits: ValidationLimits, own: bool) -> Judged:
+def _judged(term: TermName, profile: Profile, session: Session, limits: ValidationLimits, fitted: Fitted) -> Judged:
     if not session.steps(term):
         return _not_counted(term, "NOT_CAPTURED", "The session has no captures of this term.")
     if profile.result(term).status is FitStatus.NOT_CAPTURED:
@@ -130,9 +131,10 @@ def _judged(term: TermName, profile: Profile, session: Session, limits: Validati
             term, "NOT_CAPTURED", "The profile has no captures of this term: there is nothing to judge."
         )
     try:
-        return _predicted(term, profile, session, limits, own)
+        found = _predicted(term, profile, session, limits, fitted.count > 0)
     except MissingStepError as error:
         return _not_counted(term, "NOT_CAPTURED", f"The session has captures of a part of this term. {error}")
+    return replace(found, checks=(*found.checks, *_partly_own(term, fitted).checks)) if fitted.partly else found
 
 
 def _predicted(term: TermName, profile: Profile, session: Session, limits: ValidationLimits, own: bool) -> Judged:
@@ -153,27 +155,32 @@ def _not_counted(term: TermName, name: str, what: str) -> Judged:
     return Judged((Check(term, name, None, None, "", None, what),))
 
 
-def _own(result: FitResult, steps: Sequence[StoredStep], same_session: bool) -> bool:
-    """Whether a term was fitted to these captures; where the profile does not name them, to this very session.
-
-    A session with other steps beside them has the same captures.
-    """
-    if not steps or result.captures is None:
-        return bool(steps) and same_session
-    return result.captures.sha256 == captures_of(steps).sha256
+def _partly_own(term: TermName, fitted: Fitted) -> Judged:
+    what = (
+        f"The profile was fitted to {fitted.count} of the {fitted.steps} steps of this term in the session: these "
+        "confirm little."
+    )
+    return _not_counted(term, "captures of the profile's fit", what)
 
 
-def _advice(failed: tuple[TermName, ...], own: tuple[TermName, ...], counted: tuple[TermName, ...]) -> str:
+def _advice(
+    failed: tuple[TermName, ...],
+    own: tuple[TermName, ...],
+    partly: tuple[TermName, ...],
+    counted: tuple[TermName, ...],
+) -> str:
     if failed:
         terms = " and ".join(failed)
         return (
             f"Do not rely on {terms} of this profile for captures like these: calibrate the rig again, or look below."
         )
-    if others := [term for term in counted if term not in own]:
-        if not own:
+    known, how = (*own, *partly), ", at least in part, those" if partly else " the ones"
+    if others := [term for term in counted if term not in known]:
+        if not known:
             return "Go on with this profile: it predicts the session's captures."
         return (
             f"Go on with this profile: it predicts the session's captures of {' and '.join(others)}. Those of "
-            f"{' and '.join(own)} are the ones that it was fitted to, and confirm little."
+            f"{' and '.join(known)} are{how} that it was fitted to, and confirm little."
         )
-    return "The profile describes the captures that it was fitted to; capture others to confirm it."
+    captures = "captures that are, at least in part, those" if partly else "the captures"
+    return f"The profile describes {captures} that it was fitted to; capture others to confirm it."
