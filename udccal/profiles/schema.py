@@ -1,4 +1,4 @@
-"""``profile.json``, format version 5, which docs/profile.md describes."""
+"""``profile.json``, format version 6, which docs/profile.md describes."""
 
 from __future__ import annotations
 
