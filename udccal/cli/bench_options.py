@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, final
@@ -41,6 +42,9 @@ Serial = Annotated[str | None, typer.Option("--serial", help="Serial number; nee
 Files = Annotated[Path | None, typer.Option("--files", help="Folder with one folder of pictures per step.")]
 Display = Annotated[DisplayKind, typer.Option("--display", help=_DISPLAY_HELP)]
 Monitor = Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel; see doctor.")]
+Practice = Annotated[
+    bool, typer.Option("--practice", help="With --camera sim: you lead a simulated hand, which may do wrong.")
+]
 Agree = Annotated[bool, typer.Option("--yes", help="Go on by itself wherever all is in order.")]
 
 
@@ -55,6 +59,7 @@ class BenchOptions:
         files: folder with one folder of pictures per step, for ``CameraKind.files``.
         display, monitor: how a real panel shows pictures.
         seed, noise_seed: specimen and noise of a simulated rig; noise as the specimen where there is no seed for it.
+        practice: whether a person leads a simulated hand at the simulated rig.
     """
 
     camera: CameraKind
@@ -64,11 +69,33 @@ class BenchOptions:
     monitor: int
     seed: int
     noise_seed: int | None = None
+    practice: bool = False
 
     @property
     def real(self) -> bool:
         """Whether a person has to set things up before the camera."""
         return self.camera in (CameraKind.u3v, CameraKind.pylon)
+
+    @property
+    def led(self) -> bool:
+        """Whether a person is led through the capture."""
+        return self.practice or self.real
+
+    def check_words(self, for_led: Mapping[str, bool]) -> None:
+        """Refuse options that do not go together.
+
+        Args:
+            for_led: whether each option was given that is for a person who is led, by its name.
+
+        Raises:
+            typer.BadParameter: with the options that do not go together.
+        """
+        if self.practice and self.camera is not CameraKind.sim:
+            raise typer.BadParameter("--practice is for the simulated rig: give --camera sim with it, or leave it out.")
+        if any(for_led.values()) and not self.led:
+            *most, last = for_led
+            names = f"{', '.join(most)} and {last} are" if most else f"{last} is"
+            raise typer.BadParameter(f"{names} for --camera u3v or pylon, and for --practice.")
 
     def capture(self, output: Output, rig: RigDescription, wanted: Wanted, person: Person | None, agree: bool) -> bool:
         """Capture a session; return False when the person has stopped it.

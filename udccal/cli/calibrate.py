@@ -18,6 +18,7 @@ from udccal.cli.bench_options import (
     DisplayKind,
     Files,
     Monitor,
+    Practice,
     Serial,
 )
 from udccal.cli.options import (
@@ -67,9 +68,7 @@ def calibrate(
         list[str] | None,
         typer.Option("--again", metavar="STEP", help="Capture this captured step once more; may be given again."),
     ] = None,
-    practice: Annotated[
-        bool, typer.Option("--practice", help="With --camera sim: you lead a simulated hand, which may do wrong.")
-    ] = False,
+    practice: Practice = False,
     yes: Agree = False,
     json_events: Annotated[
         bool, typer.Option("--json-events", help="Write what happens on standard output, one JSON object a line.")
@@ -86,9 +85,8 @@ def calibrate(
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
 
-    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed)
-    led = practice or options.real
-    _check_words(camera, led, practice, yes or json_events or web)
+    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed, practice)
+    options.check_words({"--yes": yes, "--json-events": json_events, "--web": web})
     if port and not web:
         raise typer.BadParameter("--port is for the page: give --web with it, or leave it out.")
     output: Output = replace(context.obj, events=json_events)
@@ -98,19 +96,12 @@ def calibrate(
     wanted = Wanted(
         session, [t.value for t in term or TermChoice], {Exchanged(part.value) for part in exchanged or ()}, again or ()
     )
-    with _person(output, description, port if web else None) if led else nullcontext() as person:
+    with _person(output, description, port if web else None) if options.led else nullcontext() as person:
         goes_on = options.capture(output, description, wanted, person, yes)
     if not goes_on:
         raise typer.Exit(STOPPED)
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
-
-
-def _check_words(camera: CameraKind, led: bool, practice: bool, of_led: bool) -> None:
-    if practice and camera is not CameraKind.sim:
-        raise typer.BadParameter("--practice is for the simulated rig: give --camera sim with it, or leave it out.")
-    if of_led and not led:
-        raise typer.BadParameter("--yes, --json-events and --web are for --camera u3v or pylon, and for --practice.")
 
 
 def _person(output: Output, rig: RigDescription, port: int | None) -> AbstractContextManager[Person]:

@@ -16,6 +16,7 @@ from udccal.cli.bench_options import (
     DisplayKind,
     Files,
     Monitor,
+    Practice,
     Serial,
 )
 from udccal.cli.options import CHANGED, STOPPED, FoundProfile, NoiseSeed, Seed
@@ -31,6 +32,7 @@ def check(
     monitor: Monitor = 0,
     seed: Seed = 0,
     noise_seed: NoiseSeed = None,
+    practice: Practice = False,
     yes: Agree = False,
     out: Annotated[Path, typer.Option("--out", help="Folder for the captures, check.json and check.html.")] = Path(
         "udccal-check"
@@ -42,7 +44,8 @@ def check(
     """Check a rig against its profile: ten flats, twenty dark frames and three panel pictures, in three minutes."""
     from udccal.cli.jobs.check import check_profile
 
-    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed)
+    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed, practice)
+    options.check_words({"--yes": yes})
     same = check_profile(context.obj, profile, options, yes, out, update)
     if not same:
         raise typer.Exit(STOPPED if same is None else CHANGED)

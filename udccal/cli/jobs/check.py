@@ -13,7 +13,7 @@ from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
 from udccal.drift.check import RigCheck, Solved, check_measured, check_rig, short_rig
 from udccal.drift.update import updated
-from udccal.errors import SessionError
+from udccal.errors import MissingStepError, SessionError
 from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.profiles.profile import Profile
@@ -60,7 +60,7 @@ def check_profile(
         for file in (out / "check.html", out / "check.json"):
             file.unlink(missing_ok=True)
     wanted = Wanted(folder, ("wire", "backscatter"), like=profile)
-    person = TerminalPerson(output) if options.real else None
+    person = TerminalPerson(output) if options.led else None
     if not options.capture(output, rig, wanted, person, agree):
         return None
     with output.stage("comparing"):
@@ -82,9 +82,14 @@ def check_profile(
 
 
 def _compared(profile: Profile, session: Path, out: Path) -> tuple[RigCheck, Solved]:
-    """Compare; captures that cannot be used are put aside, so that the next check does not go on with them."""
+    """Compare; captures that cannot be used are put aside, so that the next check does not go on with them.
+
+    Where a step was left out, the others stay: the next check captures that step alone.
+    """
     try:
         return check_rig(profile, Session.open(session))
+    except MissingStepError:
+        raise
     except SessionError:
         with storing_in(out):
             _put_aside(session)
