@@ -113,7 +113,7 @@ class Captures:
         files: number of the files. frames: number of the camera's frames in them.
         gain_dB: lowest and highest.
         completed_at: of the first and of the last step, in ISO 8601.
-        temperature_C: lowest and highest of the sensor; None where the session has none.
+        temperature_C: lowest and highest of the captures that have one; None where none has.
         steps: digest of each step, sorted (``sessions.evidence.step_digest``); None where they are not known.
     """
 

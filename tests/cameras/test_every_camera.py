@@ -121,6 +121,11 @@ def test_says_which_settings_it_accepted(camera: Camera, backend: Backend) -> No
     assert camera.configure(accepted) == accepted
 
 
+def test_frames_say_a_temperature_or_none(camera: Camera, backend: Backend) -> None:
+    (frame,) = taken(camera, backend, 1)
+    assert frame.temperature_C is None or -50 < frame.temperature_C < 150
+
+
 def test_takes_the_whole_sensor(camera: Camera, backend: Backend) -> None:
     region = camera.configure(replace(backend.settings, region=camera.sensor)).region
     assert region == camera.sensor

@@ -57,6 +57,16 @@ def test_older_names_are_found() -> None:
     assert controls.ticks_per_s(nodes) == 125e6
 
 
+def test_the_temperature_is_that_of_the_sensor_or_of_an_older_name() -> None:
+    place = Choice("Coreboard", ("Coreboard", "Sensorboard"))
+    newer = NodeMap(DeviceTemperatureSelector=place, DeviceTemperature=Number(41.0))
+    assert controls.read_temperature(Nodes(newer)) == 41.0
+    assert place.value == "Sensorboard"
+    assert controls.read_temperature(Nodes(older_camera(TemperatureAbs=Number(44.5)))) == 44.5
+    assert controls.read_temperature(Nodes(older_camera(TemperatureAbs=Number(float("nan"))))) is None
+    assert controls.read_temperature(Nodes(older_camera())) is None
+
+
 def test_a_gain_without_a_unit_is_set_to_its_least() -> None:
     node_map = older_camera()
     controls.write_settings(Nodes(node_map), Settings(0.02, 0.0, Region(8, 6, 320, 240)))

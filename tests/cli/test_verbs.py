@@ -109,8 +109,9 @@ def test_profile_show_lists_what_was_measured(folder: Path) -> None:
     noise = shown["terms"][0]
     assert (len(noise["captures"]["sha256"]), noise["effort"]) == (64, "full")
     assert noise["captures"]["frames"] >= noise["captures"]["files"] > 0
-    assert noise["captures"]["temperature_C"] is None
+    assert noise["captures"]["temperature_C"] == [35.0, 35.0]
     assert "The noise fit used" in done.stderr
+    assert " dB at 35 °C, captured" in " ".join(done.stderr.split())
     assert shown["estimates"][0]["what"] == "Digital numbers per electron (EMVA 1288: K)."
     assert (shown["rig_state"]["terms"], len(shown["rig_state"]["estimates"])) == ([], 11)
 

@@ -30,7 +30,7 @@ class Script:
                 return
             index, self.next = self.next, self.next + 1
             data = self.rng.normal(self.means[index], 4.0, (ROWS, COLUMNS)).round().clip(0, 4095).astype(np.uint16)
-            yield Frame(data, SETTINGS, 0.1 * index, self.ids[index], index not in self.torn)
+            yield Frame(data, SETTINGS, 0.1 * index, self.ids[index], index not in self.torn, 30.0 + index // 20)
 
 
 def reasons(average) -> dict[str, int]:
@@ -58,6 +58,7 @@ def test_a_steady_scene_loses_no_frame() -> None:
     assert (average.frames, average.rejected) == (40, ())
     assert average.first_timestamp_s == 0.0
     assert average.last_timestamp_s == pytest.approx(3.9)
+    assert average.temperature_C == 31.0  # of the last frame
     assert float(average.mean.mean()) == pytest.approx(1000, abs=0.2)
     assert float(average.variance.mean()) == pytest.approx(16.08, rel=0.05)
 

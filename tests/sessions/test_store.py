@@ -23,9 +23,9 @@ RIG = load_rig("lg55-reduced")
 NESTED = "[" * 100_000
 
 
-def frame(seed: int = 0) -> SingleFrame:
+def frame(seed: int = 0, temperature_C: float | None = None) -> SingleFrame:
     data = np.random.default_rng(seed).integers(0, 4096, (24, 32)).astype(np.uint16)
-    return SingleFrame(Frame(data, SETTINGS, 1.5, 7, True))
+    return SingleFrame(Frame(data, SETTINGS, 1.5, 7, True, temperature_C))
 
 
 def average() -> AveragedFrames:
@@ -38,7 +38,7 @@ def average() -> AveragedFrames:
 def folder(tmp_path: Path) -> Path:
     path = tmp_path / "session"
     writer = SessionWriter.create(path, RIG, CAMERA)
-    writer.add_step("noise/dark_0", "noise", DarkSubject(), [frame(0), frame(1)])
+    writer.add_step("noise/dark_0", "noise", DarkSubject(), [frame(0, 35.5), frame(1)])
     writer.add_step("wire/flat", "wire", FlatSubject(), [average()])
     picture = np.zeros((RIG.panel.rows, RIG.panel.columns, 3), np.uint8)
     picture[..., 1] = 9
@@ -68,6 +68,14 @@ def test_what_was_written_is_read(folder: Path) -> None:
     assert session.picture(shown.subject)[5, 5].tolist() == [0, 9, 0]
     assert (session.rig, session.camera.serial) == (RIG, "0001")
     assert session.steps("psf") == ()
+
+
+def test_the_temperature_is_kept_and_may_be_absent(folder: Path) -> None:
+    first, second = Session.open(folder).step("noise/dark_0").captures
+    assert (first.temperature_C, second.temperature_C) == (35.5, None)
+    # As a session from before it was stored, or one of another program.
+    edit(folder, lambda m: [c.pop("temperature_C") for s in m["steps"] for c in s["captures"]])
+    assert {c.temperature_C for s in Session.open(folder).manifest.steps for c in s.captures} == {None}
 
 
 def test_a_step_not_captured_and_the_wrong_kind_are_named(folder: Path) -> None:

@@ -38,19 +38,20 @@ def description_of(model: CameraModel) -> str:
         'ProductGuid="5E1DD0C1-98A4-4E5A-9E4B-0C9B2E6C4A11" VersionGuid="A3C4BC1E-7B4E-4F37-8B2A-3C0E5C1F7D52" '
         'xmlns="http://www.genicam.org/GenApi/Version_1_1">\n'
     )
-    parts = (_categories(model), _device(), _format(model), _analog(model), _acquisition(model), _transport())
+    parts = (_categories(model), _device(model), _format(model), _analog(model), _acquisition(model), _transport())
     return head + "".join(parts) + (_chunks() if model.chunks else "") + "</RegisterDescription>\n"
 
 
 def _categories(model: CameraModel) -> str:
     names = ["DeviceControl", "ImageFormatControl", "AnalogControl", "AcquisitionControl", "TransportLayerControl"]
     device = ("DeviceVendorName", "DeviceModelName", "DeviceFamilyName", "DeviceVersion", "DeviceManufacturerInfo")
+    warmth = ("DeviceTemperature",) if model.temperature else ()
     size = ("SensorWidth", "SensorHeight", "WidthMax", "HeightMax", "Width", "Height", "OffsetX", "OffsetY")
     trigger = ("TriggerSelector", "TriggerMode", "TriggerSource", "TriggerSoftware")
     rate = ("AcquisitionFrameRateEnable", "AcquisitionFrameRate", "ExposureAuto", "ExposureTime")
     acquisition = ("AcquisitionMode", "AcquisitionFrameCount", "AcquisitionStart", "AcquisitionStop", *rate, *trigger)
     parts = [
-        xml.category("DeviceControl", *device, "DeviceSerialNumber", "DeviceUserID", "DeviceTemperature"),
+        xml.category("DeviceControl", *device, "DeviceSerialNumber", "DeviceUserID", *warmth),
         xml.category("ImageFormatControl", *size, "PixelFormat"),
         xml.category("AnalogControl", "GainAuto", "Gain"),
         xml.category("AcquisitionControl", *acquisition),
@@ -63,7 +64,9 @@ def _categories(model: CameraModel) -> str:
     return xml.category("Root", *names) + "".join(parts)
 
 
-def _device() -> str:
+def _device(model: CameraModel) -> str:
+    warmth = xml.formula("SwissKnife", "DeviceTemperature", "TemperatureRaw / 16.0", "TemperatureRaw", unit="C")
+    warmth += xml.register("TemperatureRaw", at.TEMPERATURE_RAW, cached=False, signed=True)
     return (
         xml.string_register("DeviceVendorName", at.MANUFACTURER_NAME)
         + xml.string_register("DeviceModelName", at.MODEL_NAME)
@@ -72,8 +75,7 @@ def _device() -> str:
         + xml.string_register("DeviceManufacturerInfo", at.MANUFACTURER_INFO)
         + xml.string_register("DeviceSerialNumber", at.SERIAL_NUMBER)
         + xml.string_register("DeviceUserID", at.USER_DEFINED_NAME)
-        + xml.formula("SwissKnife", "DeviceTemperature", "TemperatureRaw / 16.0", "TemperatureRaw", unit="C")
-        + xml.register("TemperatureRaw", at.TEMPERATURE_RAW, cached=False, signed=True)
+        + (warmth if model.temperature else "")
     )
 
 

@@ -40,6 +40,7 @@ class CameraModel:
         alignment: of the stream's transfer sizes, bytes; a power of two.
         event_interface: whether there is an event interface, which stands between control and streaming.
         chunks: whether it can append chunk data.
+        temperature: whether it says its temperature.
         response_ms: longest time to an acknowledge that it promises.
     """
 
@@ -62,6 +63,7 @@ class CameraModel:
     alignment: int = 1024
     event_interface: bool = True
     chunks: bool = True
+    temperature: bool = True
     response_ms: int = 200
 
     @property

@@ -5,6 +5,11 @@ from __future__ import annotations
 from udccal.cameras.protocol import Features, Mode, Range, Region, Settings
 from udccal.errors import CameraError
 
+# What may be the temperature of a camera: not below absolute zero, and not of an oven.
+COLDEST_C, HOTTEST_C = -273.15, 500.0
+# GenICam's places of DeviceTemperatureSelector that count, the best first; a camera without them measures elsewhere.
+TEMPERATURE_PLACES = ("Sensor", "Sensorboard")
+
 
 def check_settings(settings: Settings, features: Features, sensor: Region) -> None:
     """Refuse an exposure, gain or region that a camera does not have; NaN is outside every range.
@@ -15,6 +20,11 @@ def check_settings(settings: Settings, features: Features, sensor: Region) -> No
     _check_range("an exposure in s", settings.exposure_s, features.exposure_s)
     _check_range("a gain in dB", settings.gain_dB, features.gain_dB)
     check_region(settings.region, sensor, features.region_steps)
+
+
+def temperature_or_none(found_C: float) -> float | None:
+    """Return a temperature, or None for a number that is none: a camera's wrong reading must not end a capture."""
+    return found_C if COLDEST_C <= found_C <= HOTTEST_C else None
 
 
 def check_region(region: Region, sensor: Region, steps: tuple[int, int, int, int]) -> None:

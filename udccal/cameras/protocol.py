@@ -105,6 +105,8 @@ class Frame:
         timestamp_s: start of the exposure on the camera's clock.
         frame_id: the camera's own count; a gap is a frame that never arrived.
         complete: False when samples are missing; those are 0.
+        temperature_C: of the sensor, or of the place nearest to it that the camera measures, when the camera began to
+            deliver; None where it says none.
     """
 
     data: UInt16[np.ndarray, "rows columns"]
@@ -112,6 +114,7 @@ class Frame:
     timestamp_s: float
     frame_id: int
     complete: bool
+    temperature_C: float | None = None
 
 
 @runtime_checkable

@@ -189,6 +189,7 @@ class PylonCamera:
             raise superseded()
         with translated(device.sdk, device.camera, "to read the camera's settings"):
             settings, software = controls.read_settings(device.nodes), self.mode.trigger is Trigger.SOFTWARE
+            temperature_C = controls.read_temperature(device.nodes)
             timeout_s = self._timeout_s + max(settings.exposure_s, controls.frame_period_s(device.nodes))
             ticks_per_s = controls.ticks_per_s(device.nodes)
         self._ids.begin_stream()
@@ -199,7 +200,8 @@ class PylonCamera:
                     raise superseded()
                 if software:
                     trigger(device, timeout_s)
-                yield self._frame(retrieve(device, timeout_s), settings, ticks_per_s)
+                frame = self._frame(retrieve(device, timeout_s), settings, ticks_per_s)
+                yield replace(frame, temperature_C=temperature_C)
         finally:
             if self._stream == stream:  # otherwise it has ended, and another may run
                 stop(device)

@@ -25,6 +25,8 @@ _STEPS = (2, 2, 2, 2)
 _DEFAULT_EXPOSURE_S = 8e-3
 # Frames are computed ahead on this many threads; their noise is seeded per frame, so the number changes nothing.
 _THREADS = 2
+# The dark current of a simulated sensor is that of this temperature, and stays.
+_TEMPERATURE_C = 35.0
 
 
 @final
@@ -169,7 +171,7 @@ class SimulatedCamera:
         self, rate: Float[np.ndarray, "rows columns"], settings: Settings, timestamp_s: float, frame_id: int
     ) -> Frame:
         data = self._world.develop(rate, settings, frame_id)
-        return Frame(data, settings, timestamp_s, frame_id, complete=True)
+        return Frame(data, settings, timestamp_s, frame_id, complete=True, temperature_C=_TEMPERATURE_C)
 
     def _hand_out(self, developed: Future[Frame]) -> Frame:
         """Return the frame after the faults of the link."""

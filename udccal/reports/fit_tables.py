@@ -52,13 +52,18 @@ def captures_sentence(result: FitResult) -> str:
             f"What the {result.name} fit used and left out is not known: older profiles, and those that a check has "
             "updated, do not say so."
         )
-    gains = " to ".join(dict.fromkeys(f"{gain:g}" for gain in used.gain_dB))
+    warm = "" if used.temperature_C is None else f" at {_span(used.temperature_C)} °C"
     times = " to ".join(dict.fromkeys(used.completed_at))
     effort = "" if result.effort in ("full", None) else f" Its effort was {result.effort}: a full fit may be better."
     return (
-        f"The {result.name} fit used {used.frames} frames in {used.files} files, with a gain of {gains} dB, captured "
-        f"{times}.{effort}"
+        f"The {result.name} fit used {used.frames} frames in {used.files} files, with a gain of "
+        f"{_span(used.gain_dB)} dB{warm}, captured {times}.{effort}"
     )
+
+
+def _span(low_high: tuple[float, float]) -> str:
+    """Lowest and highest; once where they are the same."""
+    return " to ".join(dict.fromkeys(f"{value:.4g}" for value in low_high))
 
 
 def _before(one: Estimate) -> str:

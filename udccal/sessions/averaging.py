@@ -83,6 +83,7 @@ def average_frames(deliver: Callable[[int], Iterator[Frame]], count: int, checks
                 first_timestamp_s=ends[0].timestamp_s,
                 last_timestamp_s=ends[-1].timestamp_s,
                 rejected=checks.rejections(),
+                temperature_C=ends[-1].temperature_C,
             )
         if wanted >= _ENOUGH_TO_TELL and (moments.frames if moments is not None else 0) == before:
             break  # the cause will remain: a lamp that changed for good, or a scene that clips

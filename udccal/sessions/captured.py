@@ -21,7 +21,7 @@ class SingleFrame:
 
 @dataclass(frozen=True)
 class AveragedFrames:
-    """Mean in DN and unbiased variance in DN^2 of single frames, with their settings and times."""
+    """Mean in DN and unbiased variance in DN^2 of single frames, with their settings, times and temperature."""
 
     mean: Float32[np.ndarray, "rows columns"]
     variance: Float32[np.ndarray, "rows columns"]
@@ -30,6 +30,7 @@ class AveragedFrames:
     first_timestamp_s: float
     last_timestamp_s: float
     rejected: tuple[Rejection, ...] = ()
+    temperature_C: float | None = None
 
 
 Capture = SingleFrame | AveragedFrames

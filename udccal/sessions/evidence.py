@@ -12,12 +12,13 @@ _STEP_DIGITS = 16
 
 
 def captures_of(steps: Sequence[StoredStep]) -> Captures:
-    """Return digests, counts, gain and times of a term's steps, of which there must be one at least.
+    """Return digests, counts, gain, times and temperature of a term's steps, of which there must be one at least.
 
     The digest is the SHA-256 of the sorted checksums of all files, the panel's pictures included, one a line. The order
     of capture and the session's name do not change it.
     """
     captures, sums = [capture for step in steps for capture in step.captures], _checksums(steps)
+    temperatures = [capture.temperature_C for capture in captures if capture.temperature_C is not None]
     gains, times = [capture.gain_dB for capture in captures], [step.completed_at for step in steps]
     return Captures(
         sha256=_digest(sums),
@@ -25,6 +26,7 @@ def captures_of(steps: Sequence[StoredStep]) -> Captures:
         frames=sum(capture.frames for capture in captures),
         gain_dB=(min(gains), max(gains)),
         completed_at=(min(times), max(times)),
+        temperature_C=(min(temperatures), max(temperatures)) if temperatures else None,
         steps=tuple(sorted(step_digest(step) for step in steps)),
     )
 

@@ -30,8 +30,9 @@ def place_capture(folder: Path, stem: str, capture: Capture) -> StoredCapture:
         case SingleFrame(frame, rejected):
             name, frames, settings = f"{stem}.png", 1, frame.settings
             first_s = last_s = frame.timestamp_s
+            temperature_C = frame.temperature_C
             write_png16(_place(folder, name), frame.data)
-        case AveragedFrames(mean, variance, frames, settings, first_s, last_s, rejected):
+        case AveragedFrames(mean, variance, frames, settings, first_s, last_s, rejected, temperature_C):
             name = f"{stem}.exr"
             write_exr(_place(folder, name), {"mean": mean, "variance": variance})
     return StoredCapture(
@@ -45,6 +46,7 @@ def place_capture(folder: Path, stem: str, capture: Capture) -> StoredCapture:
         first_timestamp_s=first_s,
         last_timestamp_s=last_s,
         rejected=rejected,
+        temperature_C=temperature_C,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from udccal.cameras.checks import COLDEST_C, HOTTEST_C
 from udccal.rig import RigDescription
 
 TermName = Literal["noise", "geometry", "wire", "psf", "backscatter"]
@@ -40,7 +41,8 @@ class Rejection(_Strict):
 class StoredCapture(_Strict):
     """One file of camera data: a single frame (16-bit PNG) or an average (EXR with ``mean`` and ``variance``).
 
-    ``variance`` is the unbiased sample variance of single frames (not of their mean), in DN^2.
+    ``variance`` is the unbiased sample variance of single frames (not of their mean), in DN^2. ``temperature_C`` is
+    None where the camera said none, and in sessions from before it was stored.
     """
 
     kind: Literal["frame", "average"]
@@ -53,6 +55,7 @@ class StoredCapture(_Strict):
     first_timestamp_s: float
     last_timestamp_s: float
     rejected: tuple[Rejection, ...] = ()
+    temperature_C: Annotated[float, Field(ge=COLDEST_C, le=HOTTEST_C)] | None = None
 
     @model_validator(mode="after")
     def _kind_fits_file(self) -> StoredCapture:

@@ -135,6 +135,26 @@ def test_camera_without_chunks_gives_the_accepted_settings() -> None:
         assert [f.settings for f in camera.frames(3)] == [accepted] * 3
 
 
+def test_frames_carry_the_temperature_of_before_they_began(camera: U3vCamera, device: VirtualCamera) -> None:
+    camera.configure(SETTINGS)
+    assert [frame.temperature_C for frame in camera.frames(2)] == [38.5, 38.5]
+    device._memory.put_uint(at.TEMPERATURE_RAW, 2**32 - 20 * 16)  # signed
+    assert next(iter(camera.frames(1))).temperature_C == -20.0
+
+
+def test_a_temperature_that_is_none_ends_no_capture(camera: U3vCamera, device: VirtualCamera) -> None:
+    camera.configure(SETTINGS)
+    for raw in (2**31 - 1, 2**31):
+        device._memory.put_uint(at.TEMPERATURE_RAW, raw)
+        assert next(iter(camera.frames(1))).temperature_C is None
+
+
+def test_a_camera_without_a_temperature_gives_none() -> None:
+    with U3vCamera(backend=VirtualBackend([VirtualCamera(CameraModel(temperature=False))])) as camera:
+        camera.configure(SETTINGS)
+        assert next(iter(camera.frames(1))).temperature_C is None
+
+
 def test_frame_rate_is_as_asked_or_the_fastest(camera: U3vCamera) -> None:
     camera.configure(Settings(1e-3, 0.0, REGION))
     for asked, period_s in ((25.0, 0.04), (None, 1 / 120)):

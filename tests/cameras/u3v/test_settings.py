@@ -12,7 +12,7 @@ from udccal.cameras.u3v.chunk_values import enable_chunks, tick_s
 from udccal.cameras.u3v.mode import apply_mode, choose_known_format, read_features, read_mode
 from udccal.cameras.u3v.nodes import NodeMap
 from udccal.cameras.u3v.raw_samples import send_raw_samples
-from udccal.cameras.u3v.settings import apply_settings, read_settings, sensor_region
+from udccal.cameras.u3v.settings import apply_settings, read_settings, read_temperature, sensor_region
 from udccal.errors import CameraError
 
 SENTENCE = r"Expected .* found .*\. \w+"
@@ -64,6 +64,30 @@ def test_older_names_without_offsets_and_gain() -> None:
 def test_refuses_gain_and_offset_that_it_does_not_have(settings: Settings) -> None:
     with pytest.raises(CameraError, match=SENTENCE):
         apply_settings(nodes_of()[0], settings)
+
+
+# Two temperatures, 8 bytes apart, of which the selector shows one.
+WARMTH = (
+    enumeration("DeviceTemperatureSelector", 96, Coreboard=0, Sensor=1)
+    + '<IntSwissKnife Name="WarmthAt"><pVariable Name="S">DeviceTemperatureSelectorReg</pVariable>'
+    "<Formula>104+8*S</Formula></IntSwissKnife>"
+    + number("DeviceTemperature", 104, -50.0, 200.0).replace("<Address>104</Address>", "<pAddress>WarmthAt</pAddress>")
+)
+
+
+def test_the_temperature_is_that_of_the_sensor_where_it_can_be_chosen() -> None:
+    nodes, registers = nodes_of(WARMTH)
+    struct.pack_into("<dd", registers.content, 104, 50.0, 38.0)
+    assert read_temperature(nodes) == 38.0
+    assert registers.uint(96) == 1
+
+
+@pytest.mark.parametrize("found_C", [float("nan"), float("inf"), 1e9, -300.0])
+def test_a_temperature_that_is_none_counts_as_not_said(found_C: float) -> None:
+    nodes, registers = nodes_of(number("DeviceTemperature", 104, -50.0, 200.0))
+    struct.pack_into("<d", registers.content, 104, found_C)
+    assert read_temperature(nodes) is None
+    assert read_temperature(nodes_of()[0]) is None
 
 
 def test_a_camera_without_exposure_is_refused() -> None:

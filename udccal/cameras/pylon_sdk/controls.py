@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from udccal.cameras.checks import TEMPERATURE_PLACES, temperature_or_none
 from udccal.cameras.pixel_formats import PIXEL_FORMATS
 from udccal.cameras.protocol import Features, Mode, Range, Region, Settings, Trigger
 from udccal.cameras.pylon_sdk.nodes import Nodes
@@ -13,6 +14,7 @@ _EXPOSURE: Final = ("ExposureTime", "ExposureTimeAbs")  # in us
 _GAIN: Final = ("Gain", "GainAbs")  # in dB
 _RATE: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 _RATE_ENABLE: Final = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
+_TEMPERATURE: Final = ("DeviceTemperature", "TemperatureAbs")  # in degrees Celsius
 _US_PER_S: Final = 1e6
 _NOTHING: Final = Range(0.0, 0.0)
 _FRAME_START: Final = "FrameStart"
@@ -68,6 +70,14 @@ def read_settings(nodes: Nodes) -> Settings:
     numbers = [int(nodes.number(name) or 0) for name in ("OffsetX", "OffsetY", "Width", "Height")]
     exposure_s = (nodes.number(*_EXPOSURE) or 0.0) / _US_PER_S
     return Settings(exposure_s, nodes.number(*_GAIN) or 0.0, Region(*numbers))
+
+
+def read_temperature(nodes: Nodes) -> float | None:
+    """Return the temperature in degrees Celsius, of the sensor where it can be chosen; None where there is none."""
+    for selector in ("DeviceTemperatureSelector", "TemperatureSelector"):
+        any(nodes.choose(selector, place) for place in TEMPERATURE_PLACES)
+    found_C = nodes.number(*_TEMPERATURE)
+    return None if found_C is None else temperature_or_none(found_C)
 
 
 def write_settings(nodes: Nodes, settings: Settings) -> None:

@@ -22,7 +22,7 @@ from udccal.cameras.u3v.mode import apply_mode, choose_known_format, read_featur
 from udccal.cameras.u3v.nodes import NodeMap
 from udccal.cameras.u3v.pictures import PictureReader
 from udccal.cameras.u3v.raw_samples import send_raw_samples
-from udccal.cameras.u3v.settings import apply_settings, read_settings, sensor_region
+from udccal.cameras.u3v.settings import apply_settings, read_settings, read_temperature, sensor_region
 from udccal.cameras.u3v.transport import UsbLink
 from udccal.errors import CameraError
 
@@ -174,9 +174,10 @@ class U3vCamera:
         device = self._opened()
         device.nodes.refresh()
         settings, mode = read_settings(device.nodes), read_mode(device.nodes)
+        format, temperature_C = read_format(device.nodes), read_temperature(device.nodes)
         yield from Acquisition(
             device=device,
-            reader=PictureReader(device.nodes, settings, read_format(device.nodes), self._chunk_tick_s),
+            reader=PictureReader(device.nodes, settings, format, self._chunk_tick_s, temperature_C),
             trigger=mode.trigger,
             wait_s=frame_wait_s(settings, mode, self._timeout_s),
             timeout_s=self._timeout_s,

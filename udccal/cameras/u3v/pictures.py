@@ -27,12 +27,14 @@ class PictureReader:
 
     Attributes:
         tick_s: unit of the time in chunks.
+        temperature_C: of the camera before its frames; None where it says none.
     """
 
     nodes: NodeMap
     settings: Settings
     format: PixelFormat
     tick_s: float
+    temperature_C: float | None = None
 
     def frame(self, payload: memoryview, block: Block, frame_id: int) -> Frame:
         """Return the frame in a block; its payload may be reused afterwards.
@@ -67,7 +69,7 @@ class PictureReader:
         timestamp_s = block.leader.timestamp_ns / _NS_PER_S
         if not block.leader.timestamp_ns and values.timestamp_s is not None:
             timestamp_s = values.timestamp_s
-        return Frame(data, self._taken_with(values), timestamp_s, frame_id, complete)
+        return Frame(data, self._taken_with(values), timestamp_s, frame_id, complete, self.temperature_C)
 
     def _image(self, block: Block) -> ImageInfo:
         """Return the picture that the leader announces, if it fits the settings."""

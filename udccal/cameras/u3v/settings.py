@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Final
 
+from udccal.cameras.checks import TEMPERATURE_PLACES, temperature_or_none
 from udccal.cameras.protocol import Range, Region, Settings
 from udccal.cameras.u3v.nodes import NodeMap
 from udccal.errors import CameraError
 
 _EXPOSURE: Final = ("ExposureTime", "ExposureTimeAbs")  # us; the second name is older than SFNC 1.5
 _GAIN: Final = "Gain"  # dB
+_TEMPERATURE: Final = "DeviceTemperature"  # degrees Celsius
+_TEMPERATURE_PLACE: Final = "DeviceTemperatureSelector"
 # Lowest and highest gain of a camera without one.
 _NO_GAIN: Final = Range(0.0, 0.0)
 _US_PER_S: Final = 1e6
@@ -45,6 +49,23 @@ def region_steps(nodes: NodeMap) -> tuple[int, int, int, int]:
         for name, default in zip(names, defaults, strict=True)
     ]
     return steps[0], steps[1], steps[2], steps[3]
+
+
+def read_temperature(nodes: NodeMap) -> float | None:
+    """Return the temperature in degrees Celsius, of the sensor where the camera lets it be chosen.
+
+    None where the camera has none, does not give it now, or gives a number that is none: frames are good without it. A
+    camera that is gone says so at the next command.
+    """
+    with suppress(CameraError):
+        if not nodes.has(_TEMPERATURE):
+            return None
+        if nodes.writable(_TEMPERATURE_PLACE):
+            places = nodes.choices(_TEMPERATURE_PLACE)
+            if (place := next((place for place in TEMPERATURE_PLACES if place in places), None)) is not None:
+                nodes.choose(_TEMPERATURE_PLACE, place)
+        return temperature_or_none(nodes.number(_TEMPERATURE))
+    return None
 
 
 def read_settings(nodes: NodeMap) -> Settings:
