@@ -24,6 +24,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.reports.tables import Table
 from udccal.restoration.checks import check_frame, check_raw_file
+from udccal.restoration.doubts import exposure_doubts
 from udccal.restoration.planner import planned
 from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.scene_plan import ScenePlan, Wish, read_scene_plan
@@ -147,9 +148,12 @@ def read_scene(output: Output, frames: Frames) -> Scene:
     for warning in profile.warnings:
         output.say(warning)
     shown = None if frames.panel_picture is None else read_panel_picture(frames.panel_picture, profile.rig)
-    needs = [
-        chosen_stages(profile, *_checked_frame(image, frames.exposure_s, profile), shown) for image in frames.images
-    ]
+    needs = []
+    for image in frames.images:
+        mosaic, exposure_s = _checked_frame(image, frames.exposure_s, profile)
+        for doubt in exposure_doubts(mosaic, exposure_s, profile):
+            output.say(f"{image}: {doubt}")
+        needs.append(chosen_stages(profile, mosaic, exposure_s, shown))
     return Scene(frames, profile, shown, needed_by_any(needs))
 
 
