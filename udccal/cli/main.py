@@ -36,7 +36,10 @@ def main(arguments: list[str] | None = None) -> None:
         _leave_the_rest()
         sys.exit(_PIPE_CLOSED)
     except OSError as error:
-        _leave_the_rest()
+        try:
+            sys.stdout.flush()
+        except OSError:  # it is standard output that fails
+            _leave_the_rest()
         place = str(error.filename)[:200] if error.filename else "what was asked for"
         found = f"Expected to read or write {place}, found: {error.strerror or error}."
         _fail(f"{found} Correct that place, or give another.", _FAILED, given)

@@ -9,6 +9,7 @@ from udccal.errors import FileFormatError
 MAX_SIDE = 16384
 MAX_PIXELS = 160_000_000  # the largest sensors sold have 151 million
 MAX_SAMPLES = 2 * MAX_PIXELS  # an average has means and variances
+MAX_PICTURE_BYTES = 4 * MAX_SAMPLES + (1 << 20)  # 32-bit floats that nothing shrinks, and what stands around them
 
 Shape = tuple[int, int]
 

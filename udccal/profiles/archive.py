@@ -40,6 +40,7 @@ _DAMAGES = (
     ValueError,
 )
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+_UNREADABLE = (errno.EACCES, errno.EPERM, errno.EIO)
 
 
 def pack_archive(folder: Path, path: Path) -> None:
@@ -94,6 +95,10 @@ def unpack_archive(path: Path, folder: Path, only: str | None = None) -> None:
             raise ProfileError(
                 f"Expected room to unpack {path} into {folder}, found: {error.strerror}. Free some space there, or set "
                 "TMPDIR to a folder on another disk."
+            ) from error
+        if isinstance(error, OSError) and error.errno in _UNREADABLE:
+            raise ProfileError(
+                f"Expected to read {path}, found: {error.strerror}. Check the disk and permissions."
             ) from error
         raise ProfileError(f"Expected {path} to be a whole zip file, found: {error}. Copy it again.") from error
 

@@ -19,6 +19,7 @@ from udccal.io.exr import read_exr, write_exr
 from udccal.io.hashing import sha256_file
 from udccal.io.limits import Shape
 from udccal.io.links import is_plain_file
+from udccal.io.reading import reading
 from udccal.profiles.schema import INLINE_VALUES, DType, Numbers, StoredArray
 
 _CHANNELS = ("value", "remainder", "remainder2")
@@ -99,14 +100,16 @@ def read_checked(
         ProfileError: when it is missing, a link, too large, altered, of another shape, or not an EXR file.
     """
     path = folder / file
-    if not is_plain_file(folder, path):
+    with reading(path, ProfileError):
+        size = path.stat().st_size if is_plain_file(folder, path) else None
+    if size is None:
         raise ProfileError(f"Expected the file {file} in {folder}, found none. Copy the whole profile again.")
-    size = path.stat().st_size
     if size > MAX_FILE_BYTES:
         raise ProfileError(
             f"Expected {path} to hold at most {MAX_FILE_BYTES} bytes, found {size}. It does not belong to a profile."
         )
-    found = sha256_file(path)
+    with reading(path, ProfileError):
+        found = sha256_file(path)
     if found != sha256:
         raise ProfileError(
             f"Expected {path} to have the SHA-256 {sha256[:12]}..., found {found[:12]}...: the file was changed after "

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 from udccal.errors import ProfileError
 from udccal.io.links import is_plain_file
+from udccal.io.reading import reading
 from udccal.io.whole_folder import folder_beside, read_standing
 from udccal.profiles.archive import unpacked
 from udccal.profiles.arrays import MAX_FILE_BYTES
@@ -17,6 +18,8 @@ from udccal.profiles.history import identity
 from udccal.profiles.provenance import PROFILE_NAME
 from udccal.profiles.schema import VERSION
 from udccal.profiles.store import check_replaceable, put, read_profile, read_stored, stored_files, write_profile
+
+_PIECE_BYTES = 1 << 20
 
 
 def pack_profile(source: Path, target: Path) -> None:
@@ -46,7 +49,9 @@ def unpack_profile(source: Path, target: Path) -> None:
         ProfileError: when ``source`` is not a zip file with a whole profile, or ``target`` ends in ``.zip`` or holds
             something else.
     """
-    if not source.is_file():
+    with reading(source, ProfileError):
+        there = source.is_file()
+    if not there:
         raise ProfileError(f"Expected a profile's zip file at {source}, found none. Check the path.")
     if target.suffix == ".zip":
         raise ProfileError(f"Expected the name of a folder, found {target.name}, which ends in .zip. Choose another.")
@@ -84,11 +89,22 @@ def _copy_standing(source: Path, target: Path) -> None:
     with unpacked(source) as folder, folder_beside(target) as copy:
         for name in (PROFILE_NAME, *sorted(stored_files(read_stored(folder)))):
             file = folder / name
-            if not is_plain_file(folder, file) or file.stat().st_size > MAX_FILE_BYTES:
+            with reading(file, ProfileError):
+                fits = is_plain_file(folder, file) and file.stat().st_size <= MAX_FILE_BYTES
+            if not fits:
                 raise ProfileError(
                     f"Expected the file {name} in {source}, of at most {MAX_FILE_BYTES} bytes, found none. Copy the "
                     "whole profile again."
                 )
-            shutil.copyfile(file, copy / name)
+            with (copy / name).open("wb") as stream:
+                for piece in _pieces(file):
+                    stream.write(piece)
         decode(read_stored(copy), copy)
         put(copy, target)
+
+
+def _pieces(file: Path) -> Iterator[bytes]:
+    """Yield the content of a file; an error of reading names it, one of whoever writes the content passes by."""
+    with reading(file, ProfileError), file.open("rb") as stream:
+        while piece := stream.read(_PIECE_BYTES):
+            yield piece

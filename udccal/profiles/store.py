@@ -12,6 +12,7 @@ from udccal.io.atomic import write_atomically
 from udccal.io.exr import check_path
 from udccal.io.links import is_plain_file
 from udccal.io.out_folder import storing_in
+from udccal.io.reading import reading
 from udccal.io.whole_folder import folder_beside, read_standing, replace_whole, standing
 from udccal.profiles.archive import pack_archive, unpacked
 from udccal.profiles.encode import decode, encode
@@ -138,18 +139,21 @@ def read_stored(folder: Path) -> StoredProfile:
         ProfileError: as ``read_profile``.
     """
     file = folder / PROFILE_NAME
-    if not is_plain_file(folder, file):
+    with reading(file, ProfileError):
+        size = file.stat().st_size if is_plain_file(folder, file) else None
+    if size is None:
         raise ProfileError(
             f"Expected a profile with a {PROFILE_NAME} at {folder}, found none. Check the path, calibrate the rig, or "
             f"name a rig that has one: {', '.join(_rigs_with_profiles())}."
         )
-    size = file.stat().st_size
     if size > MAX_JSON_BYTES:
         raise ProfileError(
             f"Expected {file} to hold at most {MAX_JSON_BYTES} bytes, found {size}. It does not belong to a profile."
         )
     try:
-        found = json.loads(file.read_bytes())
+        with reading(file, ProfileError):
+            content = file.read_bytes()
+        found = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise ProfileError(f"Expected {file} to be JSON, found: {error}. Restore it from a copy.") from error
     if not isinstance(found, dict):

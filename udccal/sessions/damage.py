@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from udccal.errors import FileFormatError
 from udccal.io.hashing import sha256_file
 from udccal.io.links import is_plain_file
 from udccal.sessions.schema import Manifest, PanelSubject, StoredStep
@@ -55,6 +56,9 @@ def _damage(folder: Path, step: StoredStep) -> Iterator[Damage]:
             found = sha256_file(file)
         except OSError:  # a bad sector, or permissions
             yield Damage(step.id, name, "unreadable")
+            continue
+        except FileFormatError:  # larger than anything that a capture writes
+            yield Damage(step.id, name, "changed")
             continue
         if found != expected:
             yield Damage(step.id, name, "changed")

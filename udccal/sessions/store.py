@@ -16,6 +16,7 @@ from udccal.io.hashing import sha256_file
 from udccal.io.limits import Shape
 from udccal.io.links import is_plain_file
 from udccal.io.png import read_png16, read_rgb8
+from udccal.io.reading import reading
 from udccal.rig import RigDescription
 from udccal.sessions.manifest import read_manifest
 from udccal.sessions.schema import Manifest, PanelSubject, StoredCamera, StoredCapture, StoredStep, TermName
@@ -154,8 +155,7 @@ def _shape(capture: StoredCapture) -> Shape:
 
 def _checksum(file: Path) -> str:
     try:
-        return sha256_file(file)
-    except OSError as error:
-        raise SessionError(
-            f"Expected to read {file}, found: {error.strerror}. Check the disk and permissions."
-        ) from error
+        with reading(file, SessionError):
+            return sha256_file(file)
+    except FileFormatError as error:  # too large
+        raise SessionError(str(error)) from error

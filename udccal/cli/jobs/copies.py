@@ -55,8 +55,9 @@ def migrate(output: Output, source: Path, target: Path) -> None:
 
 
 def _write(output: Output, source: Path, target: Path, write: Callable[[Path, Path], object]) -> None:
+    found = find_profile(source)
     with storing_in(target.parent):
-        write(find_profile(source), target)
+        write(found, target)
         now = identity(target)
     output.say(f"{source} -> {target} (profile {now.sha256[:12]}, format version {now.version})")
     output.result(WrittenProfile(source, target, now.version, now.sha256))
