@@ -42,6 +42,20 @@ def stamped(table: str, commits: Iterable[str] | None = None) -> str:
     return f"{table.rstrip()}\n\nMeasured at commit {', '.join(named)}."
 
 
+def note_commit(made: Path) -> None:
+    """Write this commit beside what a later run takes from its folder."""
+    _beside(made).write_text(this_commit(), encoding="utf-8")
+
+
+def noted_commit(made: Path) -> str:
+    """The commit that made what a run took from its folder."""
+    return _beside(made).read_text(encoding="utf-8")
+
+
+def _beside(made: Path) -> Path:
+    return made.with_name(f"{made.name}.commit")
+
+
 def _git(root: Path, *arguments: str) -> str:
     try:
         done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True)

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks.commit import this_commit
+from tests.benchmarks.commit import note_commit, noted_commit, this_commit
 from tests.benchmarks.readme_tables import put_table
 from tests.benchmarks.rows import Row, at_least, at_most, table, write_json
 from udccal.benches.bench import simulate, simulated_bench
@@ -138,13 +138,18 @@ class Specimen:
     @classmethod
     def calibrated(cls, number: int, folder: Path) -> Specimen:
         """Calibrate the specimen, or read the profile that the folder holds."""
-        rig, path = small_rig(), folder / f"specimen_{number:02d}"
+        rig, path = small_rig(), _kept(folder, number)
         if not path.exists():
             with tempfile.TemporaryDirectory() as place, simulate(rig, number) as bench:
                 session = capture(Path(place) / "session", bench, ("noise", "wire", "backscatter"))
                 write_profile(path, _fitted(session, draw_truth(rig, number)))
+            note_commit(path)
         truth = draw_truth(short_rig(rig), number)
         return cls(read_profile(path), truth, RigLight(truth))
+
+
+def _kept(folder: Path, number: int) -> Path:
+    return folder / f"specimen_{number:02d}"
 
 
 def _fitted(session: Session, truth: RigTruth) -> Profile:
@@ -248,7 +253,8 @@ def main() -> int:
     rows = judged(trials)
     write_json(rows, options.out / "drift.json")
     print(table(rows))
-    put_table(_PAGE, "drift", table(rows), [one.commit for one in trials])
+    specimens = {noted_commit(_kept(options.out, one.specimen)) for one in trials}
+    put_table(_PAGE, "drift", table(rows), [*specimens, *(one.commit for one in trials)])
     return 0 if all(row.ok for row in rows) else 1
 
 

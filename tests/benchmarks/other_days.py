@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.benchmarks.commit import note_commit, noted_commit, this_commit
 from tests.benchmarks.full_blur import BLUR_GRID, build_full_blur
 from tests.benchmarks.pictures import PictureBench
 from tests.benchmarks.readme_tables import put_table
@@ -74,6 +75,7 @@ def profile_of(session: Session, folder: Path) -> Profile:
     path = folder / "profile"
     if not path.exists():
         calibrate(session).or_raise().write(path)
+        note_commit(path)
     return read_profile(path)
 
 
@@ -155,13 +157,14 @@ def main() -> int:
     profiles = [profile_of(session, folder) for session, folder in zip(sessions, folders, strict=True)]
     lines = [line(case, diff(shipped, one)) for case, one in zip(CASES, profiles, strict=True)]
     docs, knocked = _ROOT / "docs", list(CASES).index(KNOCK)
+    commits = [this_commit(), *(noted_commit(folder / "profile") for folder in folders)]
     head = "| what was done to the rig | movement found | verdicts |\n| --- | --- | --- |\n"
-    put_table(docs / "diff.md", "other days", head + "\n".join(lines))
-    put_table(docs / "validate.md", "other days", checks_table(validate(shipped, sessions[0])))
-    put_table(_ROOT / "README.md", "diff", example(folders[knocked]))
+    put_table(docs / "diff.md", "other days", head + "\n".join(lines), commits)
+    put_table(docs / "validate.md", "other days", checks_table(validate(shipped, sessions[0])), commits)
+    put_table(_ROOT / "README.md", "diff", example(folders[knocked]), commits)
     rows = update_rows(shipped, profiles[knocked], truths[knocked], folders[knocked])
     print("\n".join(lines), table(rows), sep="\n")
-    put_table(docs / "check.md", "update", table(rows))
+    put_table(docs / "check.md", "update", table(rows), commits)
     return 0 if all(row.ok for row in rows) else 1
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.commit import commit_of, is_clean, stamped
+from tests.benchmarks.commit import commit_of, is_clean, note_commit, noted_commit, stamped, this_commit
 
 
 @pytest.fixture
@@ -54,3 +54,10 @@ def test_every_commit_of_a_merged_table_is_named_once() -> None:
     assert text == "| a |\n\nMeasured at commit a1 with changes, b2."
     with pytest.raises(ValueError, match="commit"):
         stamped("| a |", [])
+
+
+def test_what_a_run_keeps_has_the_commit_that_made_it(tmp_path: Path) -> None:
+    note_commit(tmp_path / "profile")
+    assert noted_commit(tmp_path / "profile") == this_commit()
+    with pytest.raises(FileNotFoundError):
+        noted_commit(tmp_path / "other")
