@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Shaped
 from procedures.metering import spot_light
 from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame
-from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.corners import board_points_mm, charuco_board
 from udccal.guide.events import Outline, Reading
 from udccal.mounting import nominal_rotation
 from udccal.rig import RigDescription
@@ -152,9 +152,7 @@ def find_corners(frame: Frame, spec: BoardSpec) -> CornersSeen:
 def corners_in(mosaic: Shaped[np.ndarray, "rows columns"], spec: BoardSpec) -> CornersSeen:
     """Return the inner corners of a board that a mosaic shows, in px of the mosaic."""
     picture, scale = _picture(mosaic)
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
-    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)
-    corners, numbers = cv2.aruco.CharucoDetector(board).detectBoard(picture)[:2]
+    corners, numbers = cv2.aruco.CharucoDetector(charuco_board(spec)).detectBoard(picture)[:2]
     if corners is None:
         return CornersSeen(np.zeros(0, np.int64), np.zeros((0, 2)))
     # The blur of 2 x 2 moves a picture by half a pixel, the magnification by another.
