@@ -67,6 +67,7 @@ def wait_for(hook: TimedHook) -> TimedHook:
     ("function", "message"),
     [
         (lambda picture, frame_id: 1 / 0, "found ZeroDivisionError: division by zero. Correct the hook"),
+        (lambda picture, frame_id: sys.exit("no model"), "found SystemExit: no model. Correct the hook"),
         (lambda picture, frame_id: None, "found NoneType"),
         (lambda picture, frame_id: picture[1:], r"of shape \(4, 6, 3\), found uint8 of shape \(3, 6, 3\)"),
         (lambda picture, frame_id: picture.astype(float), "found float64"),

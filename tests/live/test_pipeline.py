@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -99,6 +100,12 @@ def test_it_ends_where_the_frames_end_and_the_last_one_is_written() -> None:
     sink = ListSink()
     run(iter([raw_frame(number) for number in range(50)]), sink)
     assert sink.frames[-1].frame_id == 49
+
+
+def test_a_sink_that_leaves_the_program_ends_it_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ListSink, "write", lambda sink, frame: sys.exit("no projector"))
+    with pytest.raises(LiveError, match="the output to go on, found SystemExit: no projector"):
+        run(endless(), ListSink())
 
 
 def test_it_ends_when_it_is_told_to() -> None:

@@ -82,6 +82,24 @@ def test_a_profile_of_another_view_is_refused(restoring: Restoring, live_rig: Ri
         restoring.replace(Restorer.from_profile(profile_of(larger), Tier.preview))
 
 
+@pytest.mark.parametrize(
+    ("part", "change", "message"),
+    [
+        ("camera", {"bits": 10}, r"samples of 12 bits, .* found .* samples of 10 bits"),
+        ("panel", {"rows": 25}, r"a panel of 32 x 24 .* found .* a panel of 32 x 25"),
+    ],
+)
+def test_a_profile_whose_frames_or_panel_pictures_are_others_is_refused(
+    live_rig: RigDescription, live_profile: Profile, part: str, change: dict[str, int], message: str
+) -> None:
+    """Else it would end the run at the next frame."""
+    restoring = Restoring(Restorer.from_profile(live_profile, Tier.preview), np.zeros((24, 32, 3), np.uint8))
+    other = live_rig.model_copy(update={part: getattr(live_rig, part).model_copy(update=change)})
+    with pytest.raises(LiveError, match=message):
+        restoring.replace(replace(restoring._restorer, rig=other))
+    restoring.restore(raw_frame(0, level=3000), 0)
+
+
 def part_of(frame: Frame, rows: slice) -> Frame:
     """The frame as a camera delivers it that reads these rows alone."""
     region = Region(0, rows.start, frame.data.shape[1], rows.stop - rows.start)

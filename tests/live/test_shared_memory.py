@@ -41,6 +41,15 @@ def name() -> Iterator[str]:
     (FOLDER / name).unlink(missing_ok=True)
 
 
+def started(name: str) -> subprocess.Popen[str]:
+    """A writer in a process group of its own, which has written a frame."""
+    command = [sys.executable, "-c", WRITER, name]
+    writer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True)
+    assert writer.stdout is not None
+    assert writer.stdout.readline() == "written\n"
+    return writer
+
+
 def open_sink(name: str) -> SharedMemorySink:
     sink = SharedMemorySink(name, 30.0)
     sink.open((ROWS, COLUMNS))
@@ -61,16 +70,14 @@ def test_a_segment_goes_with_its_writer(name: str) -> None:
 
 
 def test_a_living_writer_is_left_alone_and_a_dead_ones_segment_is_replaced(name: str) -> None:
-    writer = subprocess.Popen([sys.executable, "-c", WRITER, name], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    writer = started(name)
     try:
-        assert writer.stdout is not None
-        assert writer.stdout.readline() == "written\n"
         with pytest.raises(LiveError, match="a run that still writes to it"):
             SharedMemorySink(name, 30.0)
         reader = frames(name)
         assert next(reader)[0] == 7
     finally:
-        writer.send_signal(signal.SIGKILL)
+        os.killpg(writer.pid, signal.SIGKILL)  # with what would remove the name
         writer.wait(30)
     start = time.monotonic()
     with pytest.raises(SystemExit, match=f"writer of {name} to live, found that it was killed"):
@@ -82,6 +89,30 @@ def test_a_living_writer_is_left_alone_and_a_dead_ones_segment_is_replaced(name:
     assert next(frames(name))[0] == 1
     sink.close()
     assert not (FOLDER / name).exists()
+
+
+def test_a_writer_that_is_killed_leaves_nothing_behind(name: str) -> None:
+    writer = started(name)
+    assert (FOLDER / name).exists()
+    writer.kill()
+    writer.wait(30)
+    deadline = time.monotonic() + 30
+    while (FOLDER / name).exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not (FOLDER / name).exists()
+
+
+def test_a_name_that_others_took_meanwhile_is_theirs(name: str) -> None:
+    code = WRITER.replace("time.sleep(600)", "sys.stdin.readline(); sink.close()")
+    command = [sys.executable, "-c", code, name]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "written\n"
+        (FOLDER / name).unlink()
+        (FOLDER / name).write_bytes(b"another program's data")
+        writer.communicate("end\n", timeout=30)
+    time.sleep(0.5)  # for what removes names
+    assert (FOLDER / name).read_bytes() == b"another program's data"
 
 
 @pytest.mark.parametrize("content", [b"", b"another program's data"])

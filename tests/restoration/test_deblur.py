@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import pytest
 
 import udccal
 from tests.scenes.grid_blur import blurred
 from udccal.errors import RestorationError
-from udccal.restoration.deblur import _noise_line
+from udccal.restoration.deblur import _finest, _noise_line
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.tiers import Tier
 
@@ -65,6 +67,35 @@ def test_units_do_not_matter(toy_grid: KernelGrid, soft: np.ndarray, unit: float
     np.testing.assert_allclose(scaled, deblurred(picture, toy_grid), rtol=1e-3, atol=5e-5)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", [np.float16, np.uint8, np.int16, ">u2", ">f4"])
+def test_the_type_of_numbers_does_not_matter(toy_grid: KernelGrid, soft: np.ndarray, kind: str | type) -> None:
+    picture = np.rint(100 * np.abs(noisy(soft, 3e3))).astype(kind)
+    unchecked = inspect.unwrap(udccal.deblur)  # programs do not have the tests' own check of types
+    places = np.arange(5, dtype=np.uint8) * 31, np.arange(4) * 31
+    found = unchecked(picture, toy_grid.kernels, *places, tile_px=TILE, workers=1)
+    exact = KernelGrid(*(np.asarray(each, float) for each in places), toy_grid.kernels)
+    np.testing.assert_allclose(found, deblurred(picture.astype(float), exact), atol=1e-2)
+
+
+@pytest.mark.parametrize("y_px", [np.array([30, 20, 10, 0], np.uint8), 2**60 + np.arange(4)])
+def test_whole_numbers_that_do_not_ascend_are_refused(toy_grid: KernelGrid, soft: np.ndarray, y_px: np.ndarray) -> None:
+    with pytest.raises(RestorationError, match="Expected ascending places"):
+        inspect.unwrap(udccal.deblur)(soft, toy_grid.kernels, toy_grid.x_px, y_px)
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["a row", "a column"])
+@pytest.mark.parametrize("tier", [Tier.fast, Tier.balanced, Tier.accurate])
+def test_the_noise_of_a_single_row_is_not_taken_for_detail(turned: bool, tier: Tier) -> None:
+    wave = np.repeat((0.5 + 0.3 * np.sin(np.arange(200) / 7))[None, :, None], 3, axis=2)
+    picture = wave + np.random.default_rng(0).normal(0, 0.1, wave.shape)
+    bell = np.exp(-(np.hypot(*np.mgrid[-2:3, -2:3]) ** 2) / 2)
+    kernels = np.tile(bell / bell.sum(), (1, 1, 3, 1, 1))
+    order = (1, 0, 2) if turned else (0, 1, 2)
+    found = udccal.deblur(picture.transpose(order), kernels, np.zeros(1), np.zeros(1), workers=1, tier=tier)
+    assert np.std(found.transpose(order) - wave) < 0.2
+
+
 def test_kernels_of_another_place_do_worse(toy_grid: KernelGrid, sharp: np.ndarray, soft: np.ndarray) -> None:
     wrong = KernelGrid(toy_grid.x_px, toy_grid.y_px, np.ascontiguousarray(toy_grid.kernels[::-1]))
     picture = noisy(soft, 3e4)
@@ -75,7 +106,7 @@ def test_noise_is_a_line_over_light() -> None:
     rng = np.random.default_rng(4)
     light = rng.uniform(0.0, 1.0, (20, 3, 1, 1)) * np.ones((1, 1, 96, 96))
     tiles = (light + rng.normal(size=light.shape) * np.sqrt(1e-4 + 2e-4 * light)).astype(np.float32)
-    np.testing.assert_allclose(_noise_line(tiles), (1e-4, 2e-4), rtol=0.1)
+    np.testing.assert_allclose(_noise_line(tiles, _finest(96, 96)), (1e-4, 2e-4), rtol=0.1)
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])

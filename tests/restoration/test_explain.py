@@ -88,6 +88,19 @@ def test_without_a_wish_it_restores_at_the_most_accurate_tier(folder: Path, caps
     assert json.loads(capsys.readouterr().out)["tier"] == "balanced"
 
 
+@pytest.mark.parametrize("name", ["frame.png", "shown.png"])
+def test_no_picture_that_was_given_is_overwritten(folder: Path, name: str) -> None:
+    (folder / "raw").mkdir()
+    (folder / "frame.png").rename(folder / "raw" / name)
+    (folder / "black.png").rename(folder / "shown.png")
+    given = Frames([folder / "raw" / name], folder / "profile", folder / "shown.png", 0.02)
+    if name == "frame.png":
+        restore_files(Output(), given, Plans(Tier.preview, None), folder, "png")
+        return
+    with pytest.raises(RestorationError, match=r"shown\.png for .* is taken"):
+        restore_files(Output(), given, Plans(Tier.preview, None), folder, "png")
+
+
 def test_what_does_not_belong_to_the_profile_is_refused_before_any_work(
     folder: Path, profile: Profile, monkeypatch: pytest.MonkeyPatch
 ) -> None:

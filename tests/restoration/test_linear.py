@@ -1,16 +1,24 @@
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 
 import numpy as np
 
 from udccal.models.noise import Noise
-from udccal.restoration.linear import saturated, to_electrons, variance_e2
+from udccal.restoration.linear import dark_DN, saturated, to_electrons, variance_e2
 
 
 def test_black_level_gain_and_dark_current(toy_noise: Noise) -> None:
     mosaic = np.array([[64, 64 + 355]], np.uint16)
     np.testing.assert_allclose(to_electrons(mosaic, toy_noise, 0.5), [[-10.0, 990.0]], atol=1e-3)
+
+
+def test_an_exposure_may_be_a_number_of_numpys(toy_noise: Noise) -> None:
+    """OpenCV, which subtracts it, takes no others than Python's."""
+    dark = inspect.unwrap(dark_DN)(toy_noise, np.float32(0.5))  # programs do not have the tests' own check of types
+    assert type(dark) is float
+    assert dark == dark_DN(toy_noise, 0.5)
 
 
 def test_a_response_that_bends_is_straightened(toy_noise: Noise) -> None:

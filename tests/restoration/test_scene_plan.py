@@ -16,6 +16,7 @@ from udccal.errors import RestorationError
 from udccal.profiles.profile import Profile
 from udccal.restoration.scene_plan import ScenePlan, TierForecast, Wish, chosen_tier, read_scene_plan
 from udccal.restoration.stages import Stage, StageChoice
+from udccal.result import Diagnostic, FitStatus
 from udccal.tiers import Tier
 
 TIERS = (
@@ -103,7 +104,21 @@ def test_a_file_that_is_not_there_is_named(profile: Profile, tmp_path: Path) -> 
         read_scene_plan(tmp_path / "absent.json", profile)
 
 
-def test_a_profile_with_another_wire_is_another_profile(plan: ScenePlan, profile: Profile, tmp_path: Path) -> None:
+OTHERS: dict[str, Callable[[Profile], Profile]] = {
+    "wire": lambda one: replace(one, wire_map=one.wire_map * np.float32(1.001)),
+    "mask": lambda one: replace(one, backscatter_mask=one.backscatter_mask + np.float32(1.0)),
+    "psf that is left out": lambda one: replace(one, psf=replace(one.psf, status=FitStatus.ABSENT)),
+    "error of the mask": lambda one: replace(
+        one,
+        backscatter=replace(one.backscatter, diagnostics=(Diagnostic("held_out_without_noise_of_peak", 0.01, "1"),)),
+    ),
+}
+
+
+@pytest.mark.parametrize("changed", OTHERS.values(), ids=OTHERS)
+def test_a_profile_with_another_part_is_another_profile(
+    plan: ScenePlan, profile: Profile, tmp_path: Path, changed: Callable[[Profile], Profile]
+) -> None:
     path = written(tmp_path / "plan.json", plain(plan))
     with pytest.raises(RestorationError, match="made for another one"):
-        read_scene_plan(path, replace(profile, wire_map=profile.wire_map * np.float32(1.001)))
+        read_scene_plan(path, changed(profile))

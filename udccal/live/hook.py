@@ -96,7 +96,7 @@ class TimedHook:
 
     def _checked(self, answer: object, picture: Picture) -> Picture:
         self._running = False
-        if isinstance(answer, Exception):
+        if isinstance(answer, BaseException):
             raise LiveError(
                 f"Expected the hook to return a picture, found {type(answer).__name__}: {answer}. Correct the hook."
             ) from answer
@@ -112,5 +112,5 @@ class TimedHook:
             picture, frame_id = self._asked.get()
             try:
                 self._answers.put(self._function(picture, frame_id))
-            except Exception as error:
+            except BaseException as error:  # sys.exit() of a hook would end this thread without a word
                 self._answers.put(error)

@@ -141,7 +141,7 @@ class Pipeline:
     def _noting(self, stage: Stage, part: Callable[[], None]) -> None:
         try:
             part()
-        except Exception as error:
+        except BaseException as error:  # sys.exit() of a sink would end this thread without a word
             if self._error is None:
                 self._error = _as_sentence(stage, error)
             self._stop.set()
@@ -194,7 +194,7 @@ class Pipeline:
         self._tally.written((written_ns - frame.captured_ns) * 1e-9, late)
 
 
-def _as_sentence(stage: Stage, error: Exception) -> UdccalError:
+def _as_sentence(stage: Stage, error: BaseException) -> UdccalError:
     if isinstance(error, UdccalError):
         return error
     sentence = LiveError(

@@ -64,7 +64,8 @@ class Restoring:
         """Use ``restorer`` from the next frame on.
 
         Raises:
-            LiveError: when its camera or its view has another size or pattern, as the sink is open for these.
+            LiveError: when its camera, panel or view has another size, or the camera another pattern or other bits. The
+                frames, the panel's picture and the sink of a run stay those of its beginning.
         """
         before, after = _sizes(self._restorer.rig), _sizes(restorer.rig)
         if before != after:
@@ -155,5 +156,6 @@ def _restorer_of(shows: Restorer | DeviceRestorer) -> Restorer:
 
 
 def _sizes(rig: RigDescription) -> str:
-    camera, view = rig.camera, rig.view
-    return f"{camera.columns} x {camera.rows} {camera.cfa} samples and a view of {view.columns} x {view.rows}"
+    camera, view, panel = rig.camera, rig.view, rig.panel
+    samples = f"{camera.columns} x {camera.rows} {camera.cfa} samples of {camera.bits} bits"
+    return f"{samples}, a panel of {panel.columns} x {panel.rows} and a view of {view.columns} x {view.rows}"

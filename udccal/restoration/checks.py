@@ -53,7 +53,7 @@ def check_count(value: object, what: str, least: int, most: int, error: type[Udc
 
 
 def real_array(value: object, what: str) -> np.ndarray:
-    """Return an array, or lists of numbers as one.
+    """Return an array, or lists of numbers as one, in single precision at least: whole numbers would wrap around.
 
     Raises:
         RestorationError: when it does not hold real numbers; ``what`` names it.
@@ -66,7 +66,7 @@ def real_array(value: object, what: str) -> np.ndarray:
         raise RestorationError(
             f"Expected {what} as an array of real numbers, found {found_instead(value)}. Convert it first."
         )
-    return found
+    return found.astype(np.result_type(found, np.float32), copy=False)
 
 
 def check_exposure(exposure_s: object, error: type[UdccalError] = RestorationError) -> None:

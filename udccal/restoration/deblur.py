@@ -27,8 +27,8 @@ from udccal.restoration.shrink import measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for
 from udccal.tiers import Tier, tier_named
 
-# The finest diagonal detail: second differences along both axes.
-_DIAGONAL = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32)
+# Second differences: the finest detail along one axis.
+_SECOND = (1.0, -2.0, 1.0)
 # Median of |x| of a normal distribution with sigma 1.
 _MEDIAN = 0.6745
 _REWEIGHTINGS = 3
@@ -83,7 +83,7 @@ def deblur(
     rows, columns = light.shape[:2]
     layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows))
     tiles = _cut(light, layout)
-    read, slope = _noise_line(tiles)
+    read, slope = _noise_line(tiles, _finest(rows, columns))
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), _LEAST_VARIANCE)).astype(np.float32)
     tables = colour_tables(grid, layout, workers)
     given = noise, tables, layout, THREE_COLOURS, workers
@@ -108,10 +108,18 @@ def _cut(
     return np.stack([layout.cut(plane) for plane in cv2.split(light)], axis=1)
 
 
-def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[float, float]:
-    """Return the variance of the noise without light, and how it grows with light."""
-    gain = float(np.sum(_DIAGONAL**2))
-    variance, light, seen = np.array([_noise_of(plane) for plane in tiles.reshape(-1, *tiles.shape[2:])]).T
+def _finest(rows: int, columns: int) -> Float32[np.ndarray, "down across"]:
+    """Return the filter for the finest detail of a picture: diagonal, or along a single row or column."""
+    down, across = (_SECOND if size > 1 else (1.0,) for size in (rows, columns))
+    return np.outer(down, across).astype(np.float32)
+
+
+def _noise_line(
+    tiles: Float32[np.ndarray, "tiles 3 rows columns"], finest: Float32[np.ndarray, "down across"]
+) -> tuple[float, float]:
+    """Return the variance of the noise without light, and how it grows with light; ``finest`` is a filter's kernel."""
+    gain = float(np.sum(finest**2))
+    variance, light, seen = np.array([_noise_of(plane, finest) for plane in tiles.reshape(-1, *tiles.shape[2:])]).T
     # Tiles that are mostly clipped or blank tell only where no others do.
     used = seen >= (0.5 if seen.max() >= 0.5 else _LEAST_SEEN)
     if not used.any():
@@ -129,12 +137,14 @@ def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[flo
     return float(read), float(slope)
 
 
-def _noise_of(plane: Float32[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
+def _noise_of(
+    plane: Float32[np.ndarray, "rows columns"], finest: Float32[np.ndarray, "down across"]
+) -> tuple[float, float, float]:
     """Return the square of the detail's sigma and the mean light of a plane, and the part of it that they are from.
 
     Clipped and blank areas have no noise. They would make that of all others seem smaller.
     """
-    detail = np.abs(cv2.filter2D(plane, cv2.CV_32F, _DIAGONAL))
+    detail = np.abs(cv2.filter2D(plane, cv2.CV_32F, finest))
     seen = cv2.dilate(detail, _NEAR) > _FLAT
     if not seen.any():
         return 0.0, 0.0, 0.0

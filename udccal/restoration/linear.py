@@ -19,7 +19,8 @@ def scalar(value: ArrayLike) -> float:
 
 def dark_DN(noise: Noise, exposure_s: float) -> float:
     """Return what a sample reads without light: black level and mean dark signal."""
-    return scalar(noise.black_DN) + scalar(noise.K_DN_per_e) * scalar(noise.dark_current_e_per_s) * exposure_s
+    dark_e = scalar(noise.dark_current_e_per_s) * float(exposure_s)  # an exposure may be a number of numpy's
+    return scalar(noise.black_DN) + scalar(noise.K_DN_per_e) * dark_e
 
 
 def to_electrons(

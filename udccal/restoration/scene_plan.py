@@ -100,7 +100,9 @@ class ScenePlan:
 
 def profile_sha256(profile: Profile) -> str:
     """Return a checksum of all that restoration reads of a profile."""
-    return checksum(profile.rig, *(result.term for result in profile.results), profile.wire_map)
+    terms = tuple((result.term, result.status.name) for result in profile.results)
+    error = profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0
+    return checksum(profile.rig, terms, profile.wire_map, profile.backscatter_mask, error)
 
 
 def chosen_tier(tiers: tuple[TierForecast, ...], wish: Wish) -> Tier:

@@ -57,7 +57,7 @@ def restore_files(
     """
     check_writable(out)
     keep_compilations()
-    targets = _targets(frames.images, out, picture_format)
+    targets = _targets(frames, out, picture_format)
     scene = read_scene(output, frames)
     plan = scene.plan(plans)
     restored: list[RestoredFile] = []
@@ -77,11 +77,12 @@ def restore_files(
     output.result(RestoreSummary(frames.profile, plan.tier, tuple(restored)))
 
 
-def _targets(images: list[Path], out: Path, picture_format: str) -> list[Path]:
-    """Return one file per image; refuse to let one overwrite another, or its own source."""
-    targets = [out / f"{image.stem}.{picture_format}" for image in images]
-    for index, (image, target) in enumerate(zip(images, targets, strict=True)):
-        if target in targets[:index] or target.resolve() == image.resolve() or target.is_dir():
+def _targets(frames: Frames, out: Path, picture_format: str) -> list[Path]:
+    """Return one file per image; refuse to let one overwrite another, or a picture that was given."""
+    targets = [out / f"{image.stem}.{picture_format}" for image in frames.images]
+    given = {each.resolve() for each in (*frames.images, frames.panel_picture) if each is not None}
+    for index, (image, target) in enumerate(zip(frames.images, targets, strict=True)):
+        if target in targets[:index] or target.resolve() in given or target.is_dir():
             raise RestorationError(
                 f"Expected names that differ in {out}, found that {target.name} for {image} is taken. "
                 "Rename the image, or choose another folder."

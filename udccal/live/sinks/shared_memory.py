@@ -1,7 +1,8 @@
 """``shm:NAME``: POSIX shared memory in which any number of other programs find the newest frames.
 
 The segment is locked by its writer for as long as the writer lives, however it ends. So one without a lock is of a
-writer that died, and the next run removes it.
+writer that died, and the next run removes it. That is needed where Python's resource tracker was killed too: it is a
+process of its own, which removes the name that a killed writer leaves.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Final, final
 
@@ -41,6 +43,7 @@ class SharedMemorySink:
             pass
         self._descriptor: int | None = None
         self._ring: FrameRing | None = None
+        self._tracking = ExitStack()
 
     def open(self, shape: tuple[int, int]) -> None:
         """Make the segment; remove that of a writer that died.
@@ -59,6 +62,9 @@ class SharedMemorySink:
             os.link(f"/proc/self/fd/{self._descriptor}", self._path, src_dir_fd=self._descriptor)
         except FileExistsError as error:
             raise _taken(self._path, "one that has just been made") from error
+        tracked = f"/{self._path.name}", "shared_memory"
+        resource_tracker.register(*tracked)
+        self._tracking.callback(resource_tracker.unregister, *tracked)
 
     def write(self, frame: RestoredFrame) -> None:
         """Publish a frame."""
@@ -73,6 +79,7 @@ class SharedMemorySink:
             self._ring.close()
         if _is_at(self._descriptor, self._path):
             self._path.unlink()
+        self._tracking.close()
         os.close(self._descriptor)
         self._descriptor = None
 
