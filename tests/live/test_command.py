@@ -204,6 +204,21 @@ def test_frames_without_their_panel_picture_are_counted(
     assert (whole["written"], whole["without_panel_picture"]) == (3, 1)
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a file that is always full")
+def test_a_full_disk_under_the_log_ends_no_run(
+    profile_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
+    camera = LiveCamera("files", None, write_raw_files(tmp_path / "raw", 3), 1e-3, 2.0, 0)
+    sink, log = f"images:{tmp_path / 'out'}", Path("/dev/full")
+    run_live(
+        Output(),
+        LiveRun(profile_folder, Tier.preview, camera, sink, None, None, "cpu", None, 1.0, Limits(), log),
+    )
+    assert len(list((tmp_path / "out").iterdir())) == 3
+    assert "The figures in /dev/full are cut short: it could not be written to." in capsys.readouterr().err
+
+
 def test_signals_that_are_ignored_stay_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """``nohup`` has SIGHUP ignored: the run goes on when its terminal closes."""
     stop = threading.Event()

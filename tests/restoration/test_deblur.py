@@ -67,6 +67,14 @@ def test_units_do_not_matter(toy_grid: KernelGrid, soft: np.ndarray, unit: float
     np.testing.assert_allclose(scaled, deblurred(picture, toy_grid), rtol=1e-3, atol=5e-5)
 
 
+@pytest.mark.parametrize("tier", [Tier.fast, Tier.balanced, Tier.accurate])
+def test_kernels_that_do_not_blur_return_the_picture(tier: Tier) -> None:
+    y, x = np.mgrid[:90, :101]
+    picture = 0.5 + 0.3 * np.sin(x / 9)[..., None] * np.cos(y[..., None] / 7 + np.arange(3))
+    found = udccal.deblur(picture, np.ones((1, 1, 3, 1, 1)), np.zeros(1), np.zeros(1), workers=1, tier=tier)
+    np.testing.assert_allclose(found, picture, atol=1e-4)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("kind", [np.float16, np.uint8, np.int16, ">u2", ">f4"])
 def test_the_type_of_numbers_does_not_matter(toy_grid: KernelGrid, soft: np.ndarray, kind: str | type) -> None:

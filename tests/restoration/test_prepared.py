@@ -120,13 +120,23 @@ def test_what_has_no_bytes_of_its_own_is_refused(folder: Path) -> None:
         kept(folder, Pair, (object(),), Maker())
 
 
-def forged(*arrays: np.ndarray) -> Callable[[bytes], bytes]:
+def sealed(content: bytes) -> Callable[[bytes], bytes]:
     """An entry with a right checksum."""
+    return lambda _: hashlib.sha256(content).digest() + content
+
+
+def forged(*arrays: np.ndarray) -> Callable[[bytes], bytes]:
     stream = io.BytesIO()
     for array in arrays:
         np.save(stream, array)
-    content = hashlib.sha256(stream.getvalue()).digest() + stream.getvalue()
-    return lambda _: content
+    return sealed(stream.getvalue())
+
+
+def without_samples(rows: int) -> bytes:
+    """The header of an array of so many rows."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": (rows, 2)})
+    return stream.getvalue()
 
 
 GOOD = pair(9.0)
@@ -142,6 +152,8 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "another number of axes": forged(GOOD.values[0], GOOD.places),
     "another size": forged(GOOD.values[:, :1], GOOD.places),
     "sizes that disagree": forged(GOOD.values, GOOD.places[:-1]),
+    "more than any memory": sealed(without_samples(2**50)),
+    "a zip file": sealed(b"PK\x03\x04" + bytes(100)),
     "not a number": forged(GOOD.values * np.float32(np.nan), GOOD.places),
 }
 
@@ -321,6 +333,7 @@ def test_tiers_share_what_both_need(
 ) -> None:
     _refuse(monkeypatch, "kernel_grid", "filter_tables", "panel_response")
     Restorer.from_profile(profile, Tier.fast, _OPTIONS, filled[0])
+    Restorer.from_profile(profile, Tier.fast, _OPTIONS, str(filled[0]))
 
 
 _USED_LATER = {

@@ -57,6 +57,19 @@ def test_restoration_brings_the_scene_back(restorer: Restorer, frame: np.ndarray
     assert after_dB > before_dB + 4.0
 
 
+@pytest.mark.parametrize("tier", list(Tier))
+def test_a_rig_that_changes_nothing_returns_the_scene(
+    toy_rig: RigDescription, toy_noise: Noise, toy_geometry: Geometry, toy_grid: KernelGrid, tier: Tier
+) -> None:
+    points = replace(toy_grid, kernels=np.tile(np.pad(np.ones((1, 1)), 1), (4, 5, 3, 1, 1)))
+    clear = replace(made(tier, toy_rig, toy_noise, toy_geometry, points), wire=np.ones((96, 128), np.float32))
+    y, x = np.mgrid[:96, :128]
+    scene = 3000 + 1500 * np.sin(x / 9)[..., None] * np.cos(y[..., None] / 7 + np.arange(3))
+    found = replace(clear, wire=None).restore(exposed(clear, points, scene.astype(np.float32)), EXPOSURE_S) * EXPOSURE_S
+    off = found - clear.rectification.apply(scene.astype(np.float32))
+    assert np.sqrt(np.mean(off**2)) < 0.02 * 3000  # a sample has 2 % of noise
+
+
 def test_a_tier_that_does_more_is_more_accurate(
     restorers: dict[Tier, Restorer], frame: np.ndarray, toy_scene: np.ndarray
 ) -> None:

@@ -89,8 +89,8 @@ def _read(path: Path, kind: type[T]) -> T | None:
             if hashlib.file_digest(stream, _CHECKSUM).digest() != stated:
                 return None
             stream.seek(_CHECKSUM_BYTES)
-            arrays = [np.load(stream, allow_pickle=False) for _ in dataclasses.fields(kind)]
-    except (OSError, ValueError, EOFError):
+            arrays = [np.lib.format.read_array(stream, allow_pickle=False) for _ in dataclasses.fields(kind)]
+    except (OSError, ValueError, EOFError, MemoryError):
         return None
     with contextlib.suppress(OSError):  # Another program may have removed it.
         os.utime(path)

@@ -100,7 +100,7 @@ class Restorer:
         profile: str | Path,
         tier: Tier | str = Tier.balanced,
         options: PlanOptions | None = None,
-        keep: Path | None = None,
+        keep: str | Path | None = None,
     ) -> Restorer:
         """Read a profile, and prepare it.
 
@@ -122,7 +122,7 @@ class Restorer:
         profile: Profile,
         tier: Tier | str = Tier.balanced,
         options: PlanOptions | None = None,
-        keep: Path | None = None,
+        keep: str | Path | None = None,
         without: frozenset[Stage] = frozenset(),
     ) -> Restorer:
         """Prepare a profile.
@@ -140,7 +140,7 @@ class Restorer:
             RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
                 finite, there is no such tier, or options are no ``PlanOptions``.
         """
-        options, tier = checked_options(options), tier_named(tier)
+        options, tier, keep = checked_options(options), tier_named(tier), None if keep is None else Path(keep)
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
         view = kept_view(geometry, rig, keep)

@@ -90,7 +90,7 @@ def run_live(output: Output, wanted: LiveRun) -> None:
 
     follower = ProfileFollower(path, lambda: restoring.replace(prepared(load_profile(path))), output.say)
     with contextlib.ExitStack() as open_:
-        write = open_.enter_context(_log(wanted.log))
+        write = open_.enter_context(_log(output, wanted.log))
         with output.stage("preparing"):
             profile = load_profile(path)
             shown = None if wanted.panel_picture is None else read_panel_picture(wanted.panel_picture, profile.rig)
@@ -154,8 +154,8 @@ def _ended_by_signals(stop: threading.Event) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _log(path: Path | None) -> Iterator[Callable[[Figures], None]]:
-    """Yield what writes figures to a file, a line of JSON each."""
+def _log(output: Output, path: Path | None) -> Iterator[Callable[[Figures], None]]:
+    """Yield what writes figures to a file, a line of JSON each. The run goes on where that fails: it is worth more."""
     if path is None:
         yield lambda figures: None
         return
@@ -163,8 +163,22 @@ def _log(path: Path | None) -> Iterator[Callable[[Figures], None]]:
         stream = path.open("w", encoding="utf-8", buffering=1)
     except OSError as error:
         raise LiveError(f"Expected --log to name a file that can be written, found: {error}. Name another.") from error
-    with stream:
-        yield lambda figures: print(json.dumps(asdict(figures)), file=stream)
+    cut_short = False
+
+    def write(figures: Figures) -> None:
+        nonlocal cut_short
+        try:
+            print(json.dumps(asdict(figures)), file=stream)
+        except OSError:
+            cut_short = True
+
+    try:
+        yield write
+    finally:
+        with contextlib.suppress(OSError):  # what could not be written before
+            stream.close()
+        if cut_short:
+            output.say(f"The figures in {path} are cut short: it could not be written to.")
 
 
 def _line(figures: Figures) -> str:
