@@ -62,6 +62,16 @@ def test_a_wire_below_the_noise_is_not_divided_by(wavy: Profile) -> None:
     assert Stage.wire in runs(chosen_stages(wavy, lamp, EXPOSURE_S, None))
 
 
+def test_a_wire_that_is_dark_in_a_few_rows_is_needed(wavy: Profile) -> None:
+    """Their samples change by more than their noise, though the wire's standard deviation is small."""
+    wire_map = np.ones_like(wavy.wire_map)
+    wire_map[30] = 1e-4
+    dim = replace(wavy, wire_map=wire_map)
+    assert np.std(wire_map) * 3 < 0.1 * 5
+    assert Stage.wire in runs(chosen_stages(dim, frame(dim, 3), EXPOSURE_S, None))
+    assert Stage.wire not in runs(chosen_stages(dim, frame(dim, 0.5), EXPOSURE_S, None))
+
+
 def test_a_profile_without_a_term_needs_no_stage_of_it(profile: Profile) -> None:
     assert Stage.wire not in runs(chosen_stages(profile, frame(profile, 3000), EXPOSURE_S, None))
 

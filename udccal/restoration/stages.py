@@ -71,7 +71,7 @@ def needed_by_any(choices: list[tuple[StageChoice, ...]]) -> tuple[StageChoice, 
 
 
 def _wire(profile: Profile, light_e: Float32[np.ndarray, "down across"], exposure_s: float) -> StageChoice:
-    swing = float(np.std(profile.wire_map))
+    swing = max(float(profile.wire_map.max()) - 1.0, 1.0 - float(profile.wire_map.min()))
     if swing == 0.0:
         return StageChoice(Stage.wire, False, "the profile has no wire")
     change = swing * np.maximum(light_e, 0.0) / np.sqrt(variance_e2(light_e, profile.noise.term, exposure_s))
@@ -79,7 +79,7 @@ def _wire(profile: Profile, light_e: Float32[np.ndarray, "down across"], exposur
     return StageChoice(
         Stage.wire,
         most >= _LEAST_SIGMAS,
-        f"where the frame is brightest, it changes a sample by {most:.3g} times its noise",
+        f"where the frame is brightest, it changes a sample by up to {most:.3g} times its noise",
     )
 
 
