@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import inspect
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -105,6 +108,24 @@ def test_sums_over_pixels_are_the_term(profile: Profile, lit: Backscatter) -> No
     np.testing.assert_allclose(found, expected, atol=1e-4 * expected.max())
     # A wrong picture is told from the right one.
     assert np.abs(PanelLight.of(lit, rig).rate(picture[::-1].copy()) - expected).max() > 0.05 * expected.max()
+
+
+def test_threads_with_pictures_of_their_own_may_share_it(profile: Profile, lit: Backscatter) -> None:
+    panel, size = PanelLight.of(lit, profile.rig), (profile.rig.panel.rows, profile.rig.panel.columns, 3)
+    pictures = [np.full(size, value, np.uint8) for value in (1, 200)]
+    expected = [panel.rate(picture).copy() for picture in pictures]
+    rate = inspect.unwrap(PanelLight.rate)  # quicker without the tests' own check of types
+
+    def wrong(turn: int) -> bool:
+        return not np.array_equal(rate(panel, pictures[turn % 2]), expected[turn % 2])
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            assert sum(pool.map(wrong, range(8000))) == 0
+    finally:
+        sys.setswitchinterval(interval)
 
 
 def test_only_the_pixels_that_are_seen_count(profile: Profile, lit: Backscatter) -> None:

@@ -74,11 +74,10 @@ class PanelSums:
 
 @final
 class _Latest:
-    """The part that is seen of the latest picture of a panel, and its backscatter."""
+    """The part that is seen of the latest picture of a panel, and its backscatter: one pair, since threads share it."""
 
     def __init__(self) -> None:
-        self.seen: UInt8[np.ndarray, "seen_rows seen_columns 3"] | None = None
-        self.rate: Float32[np.ndarray, "rows columns"] = np.empty((0, 0), dtype=np.float32)
+        self.found: tuple[UInt8[np.ndarray, "_ _ 3"], Float32[np.ndarray, "rows columns"]] | None = None
 
 
 @final
@@ -119,11 +118,11 @@ class PanelLight:
 
         The latest picture's is kept: a panel that stands still costs a comparison.
         """
-        latest, seen = self._latest, self.sums.seen(picture)
-        if latest.seen is None or not np.array_equal(latest.seen, seen):
-            latest.seen, latest.rate = seen.copy(), self._summed(seen)
-            latest.rate.setflags(write=False)
-        return latest.rate
+        found, seen = self._latest.found, self.sums.seen(picture)
+        if found is None or not np.array_equal(found[0], seen):
+            self._latest.found = found = seen.copy(), self._summed(seen)
+            found[1].setflags(write=False)
+        return found[1]
 
     def _summed(
         self, seen: UInt8[np.ndarray, "seen_rows seen_columns 3"]
