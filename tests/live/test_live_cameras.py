@@ -23,6 +23,7 @@ from udccal.live.tally import Figures
 from udccal.profiles.profile import Profile
 from udccal.restoration.runtime import Restorer
 from udccal.rig import RigDescription
+from udccal.sessions.schema import StoredCamera
 from udccal.tiers import Tier
 
 
@@ -102,6 +103,22 @@ def test_one_of_another_size_is_refused(live_profile: Profile, monkeypatch: pyte
     plug(CameraModel(columns=128, rows=64, cfa="RGGB", bits=12), Faults(), monkeypatch)
     with pytest.raises(CameraError, match=r"a camera of 96 x 64, RGGB, 12 bits .* found 128 x 64, RGGB, 12 bits"):
         run(live_profile)
+
+
+def test_another_specimen_than_the_profiles_is_refused(live_profile: Profile, plugged: U3vCamera) -> None:
+    with plugged:
+        own = plugged.identity
+    made_with = StoredCamera(vendor=own.vendor, model=own.model, serial=own.serial, backend=own.backend)
+    camera = LiveCamera("u3v", None, None, 2e-3, 25.0, 0)
+    for changes in ({}, {"serial": "elsewhere", "backend": "pylon"}):
+        with camera.open(live_profile.rig, made_with.model_copy(update=changes)):
+            pass
+    other = made_with.model_copy(update={"serial": "another"})
+    with (
+        pytest.raises(CameraError, match=r"the profile was made with, .*, serial another, found .*, serial"),
+        camera.open(live_profile.rig, other),
+    ):
+        pass
 
 
 def test_raw_files_of_another_pattern_are_refused(live_profile: Profile, tmp_path: Path) -> None:

@@ -94,7 +94,8 @@ def run_live(output: Output, wanted: LiveRun) -> None:
         with output.stage("preparing"):
             profile = load_profile(path)
             shown = None if wanted.panel_picture is None else read_panel_picture(wanted.panel_picture, profile.rig)
-            deliver = open_.enter_context(wanted.camera.open(profile.rig))  # another camera is refused at once
+            # Another camera is refused at once.
+            deliver = open_.enter_context(wanted.camera.open(profile.rig, profile.provenance.camera))
             restorer = prepared(profile)
             own = None if wanted.mirror_delay_s is None else OwnPictures(profile.rig.panel, wanted.mirror_delay_s)
             restoring = Restoring(restorer, own or shown, device)

@@ -17,7 +17,7 @@ from udccal.cameras.checks import check_settings
 from udccal.cameras.choice import check_camera, mode_for
 from udccal.cameras.files import FileCamera
 from udccal.cameras.picture_files.sidecar import list_folder
-from udccal.cameras.protocol import Camera, Frame, Range, Region, Settings
+from udccal.cameras.protocol import Camera, CameraIdentity, Frame, Range, Region, Settings
 from udccal.cameras.simulated import SimulatedCamera
 from udccal.cli.jobs.benches import pylon_camera, u3v_camera
 from udccal.cli.jobs.demonstration import portrait
@@ -26,6 +26,7 @@ from udccal.live.pacing import looped, paced, streamed
 from udccal.models.geometry import VirtualView
 from udccal.restoration.checks import check_exposure, check_number
 from udccal.rig import RigDescription
+from udccal.sessions.schema import StoredCamera
 from udccal.simulation.world import SimulatedWorld
 
 # Frames of the simulated loop. They differ in their noise.
@@ -68,8 +69,12 @@ class LiveCamera:
             check_exposure(self.exposure_s, CameraError)
 
     @contextlib.contextmanager
-    def open(self, rig: RigDescription) -> Iterator[Frames]:
+    def open(self, rig: RigDescription, made_with: StoredCamera | None = None) -> Iterator[Frames]:
         """Open the camera and check that it is the rig's; yield what then delivers its frames.
+
+        Args:
+            rig: the rig description.
+            made_with: camera of the profile's captures; None where nobody knows.
 
         Raises:
             CameraError: when it cannot be opened, does not fit the rig, or does not have the exposure.
@@ -87,6 +92,7 @@ class LiveCamera:
                 yield lambda view, shown, rows: paced(files.frames(count), self.rate_hz)
         else:
             with u3v_camera(self.serial) if self.kind == "u3v" else pylon_camera(self.serial) as real:
+                _check_specimen(real.identity, made_with)
                 self._set(real, rig)
                 check_camera(real, rig)
                 yield lambda view, shown, rows: streamed(self._reading(real, rows))
@@ -123,6 +129,15 @@ def region_of(rows: slice, sensor: Region, steps: tuple[int, int, int, int]) -> 
     first = max(rows.start - _SPARE_ROWS, 0) // step_y * step_y
     count = -(-(min(rows.stop + _SPARE_ROWS, sensor.rows) - first) // step_rows) * step_rows
     return Region(0, first, sensor.columns, count) if first + count <= sensor.rows else sensor
+
+
+def _check_specimen(found: CameraIdentity, made_with: StoredCamera | None) -> None:
+    """Refuse another camera than a profile's; only one backend's serial numbers can be compared."""
+    if made_with is not None and made_with.backend == found.backend and made_with.serial != found.serial:
+        raise CameraError(
+            f"Expected the camera that the profile was made with, {made_with.model}, serial {made_with.serial}, found "
+            f"{found.model}, serial {found.serial}. Connect the right one, or calibrate the rig with this one."
+        )
 
 
 def _within(value: float, bounds: Range) -> float:
