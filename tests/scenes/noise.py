@@ -21,7 +21,8 @@ class ToySensor:
     """A sensor and how it is measured; noise is drawn in electrons, then K, row noise, rounding and clipping.
 
     ``other_noise`` draws read noise of unit variance in place of Tukey's lambda; a fraction ``telegraph`` of the pixels
-    has three times the read noise. ``pattern`` is a relative response in addition to the white one.
+    has three times the read noise. ``pattern`` is a relative response in addition to the white one, ``dark_pattern``
+    the pixels' dark current over their mean.
     """
 
     rows: int = 96
@@ -34,6 +35,7 @@ class ToySensor:
     other_noise: Callable[[np.random.Generator, tuple[int, ...]], np.ndarray] | None = None
     telegraph: float = 0.0
     pattern: Float[np.ndarray, "rows columns"] | None = None
+    dark_pattern: Float[np.ndarray, "rows columns"] | None = None
     row_DN: float = 0.4
     dark_e_per_s: float = 40.0
     DSNU_e: float = 3.0
@@ -85,7 +87,8 @@ def expose(
     """One frame."""
     shape = fixed.response.shape
     light = sensor.lamp * sensor.flux_e_per_s * (1 + sensor.flicker * rng.standard_normal()) if lit else 0.0
-    mean = exposure_s * (np.maximum(light * fixed.response, 0.0) + sensor.dark_e_per_s)
+    dark = sensor.dark_e_per_s * (1.0 if sensor.dark_pattern is None else sensor.dark_pattern)
+    mean = exposure_s * (np.maximum(light * fixed.response, 0.0) + dark)
     counts = rng.poisson(mean).astype(np.float64)
     bent = np.minimum(counts * (1 - sensor.bend * counts / sensor.full_well_e), sensor.full_well_e)
     draw = sensor.other_noise

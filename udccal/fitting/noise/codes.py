@@ -53,6 +53,24 @@ class DarkPair:
         return np.asarray(0.5 * (edges[1:] + edges[:-1]))
 
     @property
+    def mean_DN(self) -> float:
+        """Mean code of both frames."""
+        both = self.counts.sum(axis=0) + self.counts.sum(axis=1)
+        return float(both @ self.centres_DN) / float(both.sum())
+
+    def reaching(self, low_DN: float, high_DN: float) -> DarkPair:
+        """With empty groups of codes in addition where nothing is cut off: a window of codes cuts off tails."""
+        side, step, edges = self.counts.sum(axis=1), self.step_DN, self.edges_DN.copy()
+        # No code is cut off where none lies at the end.
+        edges[[0, -1]] = np.where(side[[0, -1]] == 0, edges[[1, -2]] + [-step, step], edges[[0, -1]])
+        below, above = (
+            int(np.ceil(max(more, 0.0) / step)) if np.isfinite(more) else 0
+            for more in (edges[0] - low_DN, high_DN - edges[-1])
+        )
+        more = (edges[0] - step * np.arange(below, 0, -1), edges, edges[-1] + step * np.arange(1, above + 1))
+        return replace(self, edges_DN=np.concatenate(more), counts=np.pad(self.counts, ((below, above),) * 2))
+
+    @property
     def differences_DN(self) -> PerCode:
         """First code less the second."""
         return np.asarray(self.centres_DN[:, None] - self.centres_DN)
@@ -60,10 +78,12 @@ class DarkPair:
 
 def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:
     """Joint histogram over a window of codes around the median; codes beyond it are left out."""
-    low, middle, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 50.0, 98.0])
+    low, less, middle, more, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 16.0, 50.0, 84.0, 98.0])
     # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
     half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
-    # At most about 160 groups a side: a wide window loses nothing by coarser ones.
+    usual = int(np.ceil(3.9 * (more - less) / q_DN)) + 4
+    # At most about 160 groups a side: a wide window loses nothing by coarser ones, unless hot pixels made it wide.
+    half = usual if half > max(2 * usual, 80) else half
     group = max(1, int(np.ceil((2 * half + 1) / 160)))
     start = max(round(middle / q_DN) - half, 0)
     codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
@@ -147,19 +167,28 @@ def pair_probability(
     return np.asarray((1 - background) * joint + background / joint.size)
 
 
+def _mean_codes(pair: DarkPair, values: Five, K_DN_per_e: float, spread_DN: float, shifts_DN: Grid) -> Grid:
+    """Mean codes of samples whose signals are shifted, with offsets and row noise of normal ``spread_DN``."""
+    black, per_s, variance, _, shape = (float(v) for v in values)
+    drift = per_s * pair.exposure_s
+    # Of single codes, offsets widen the distribution as normal noise does.
+    grid, cdf = _dark_cdf(float(np.sqrt(variance)), shape, spread_DN, drift, K_DN_per_e)
+    # The window of the codes may be narrower than offsets that grow with the exposure.
+    width, reach = float(np.interp(1 - 1e-6, cdf, grid)), float(np.abs(shifts_DN).max())
+    pair = pair.reaching(black + drift - width - reach, black + drift + width + reach)
+    below = np.interp(pair.edges_DN - (black + drift + shifts_DN)[:, None], grid, cdf, left=0.0, right=1.0)
+    return np.asarray(np.diff(below, axis=1) @ pair.centres_DN)
+
+
 def row_gain(pair: DarkPair, values: Five, K_DN_per_e: float, sigma_row_DN: float) -> float:
     """How much rows' mean codes scatter for row noise of 1 DN: 1 where rounding is white and no code is cut off.
 
     Mean codes follow the signal in steps that a pixel's noise and the offsets smear. Row noise that reaches over much
     of a code moves them by more or less than the slope at black says.
     """
-    black, per_s, variance, spread2, shape = (float(v) for v in values)
-    drift, z = per_s * pair.exposure_s, np.linspace(-4.0, 4.0, 33)
-    shift = max(sigma_row_DN, 0.01 * float(np.sqrt(variance))) * z
-    # Of single codes, offsets widen the distribution as normal noise does.
-    grid, cdf = _dark_cdf(float(np.sqrt(variance)), shape, float(np.sqrt(spread2)), drift, K_DN_per_e)
-    below = np.interp(pair.edges_DN - (black + drift + shift)[:, None], grid, cdf, left=0.0, right=1.0)
-    means, weights = np.diff(below, axis=1) @ pair.centres_DN, np.exp(-0.5 * z**2)
+    z = np.linspace(-4.0, 4.0, 33)
+    shift, weights = max(sigma_row_DN, 0.01 * float(np.sqrt(values[2]))) * z, np.exp(-0.5 * z**2)
+    means = _mean_codes(pair, values, K_DN_per_e, float(np.sqrt(values[3])), shift)
     scatter, own = (float(np.cov(of, aweights=weights, ddof=0)) for of in (means, shift))
     return float(np.sqrt(scatter / own))
 
@@ -241,7 +270,9 @@ class _DarkCodes:
         black = 0.01 * float(np.sqrt(values[2])) * np.eye(5)[0]
         up, down = (self.expected(pair, values + sign * black) for sign in (1, -1))
         by_black, p, total = (up - down) / (2 * black[0]), 0.5 * (up + down), float(pair.counts.sum())
-        gain, information = float(by_black.sum(axis=1) @ pair.centres_DN), total * float(np.sum(by_black**2 / p))
+        spread = float(np.sqrt(values[3] + self.sigma_row_DN**2))
+        means = _mean_codes(pair, values, self.K_DN_per_e, spread, black[0] * np.array([-1.0, 1.0]))
+        gain, information = float(np.ptp(means) / (2 * black[0])), total * float(np.sum(by_black**2 / p))
         mean, blind = float(values[0] + values[1] * pair.exposure_s), pair.step_DN**2 / 12.0
         if information * blind < 1:
             return gain, mean, blind  # Where all samples have one code, the level is known to within rounding.

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.codes import (
     LOW,
@@ -24,13 +25,17 @@ from udccal.fitting.noise.codes import (
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
 
+PerPair = Float[np.ndarray, " _"]
+
 
 @final
 @dataclass(frozen=True)
 class DarkTerms:
     """Dark quantities; ``levels_cov`` is that of (black, dark current); ``white``: no pixel's mean shows rounding.
 
-    ``foreign``: no distribution of the family describes the read noise; its variance is that of the codes.
+    ``foreign``: no distribution of the family describes the read noise; its variance is that of the codes. ``skewed``:
+    none describes the mean code; black and dark current are those of the mean of all pixels. Black differs from
+    exposure to exposure by ``unsteady_DN``, where that is more than noise.
     """
 
     K_DN_per_e: float
@@ -44,6 +49,8 @@ class DarkTerms:
     dsnu_DN2: Quantity
     white: bool
     foreign: bool
+    skewed: bool
+    unsteady_DN: float
     fit: DarkFit
     offsets: Pattern
 
@@ -87,8 +94,10 @@ def fit_dark_terms(
         fit = fit.doubted(np.append(fitted(in_pairs, fit.values, True).values[:4], fit.values[4]))
         fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
     (_, rate, read, spread2, _), variance = fit.values.tolist(), float(fit.cov[2, 2])
+    pairs = _means(data, fit, in_pairs**2 if white else None)
     read_DN2, shot = Quantity(read, variance), K_DN_per_e * max(rate, 0.0)
-    expected = [read + rounding + shot * pair.exposure_s for pair in data.darks]
+    drifts = (pairs.rate_DN_per_s if pairs.skewed else rate) * pairs.times_s + pairs.hot_DN
+    expected = [read + rounding + K_DN_per_e * max(drift, 0.0) for drift in drifts]
     if not white:
         expected = _coded_variances(data.darks, fit, K_DN_per_e, in_pairs)
     more = unexplained_variance(data, expected, rules.most_hits)
@@ -110,10 +119,24 @@ def fit_dark_terms(
     if not white:
         pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, unresolved))
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels)
-    black, levels_cov, current = _levels(data, fit, in_pairs**2, single.value, offsets, curvature)
+    levels = _levels(data, fit, pairs, white, in_pairs**2, single.value, offsets, curvature)
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
     return DarkTerms(
-        K_DN_per_e, curvature, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, foreign, fit, offsets
+        K_DN_per_e=K_DN_per_e,
+        curvature=curvature,
+        black_DN=levels.black_DN,
+        dark_DN_per_s=levels.current,
+        levels_cov=levels.cov,
+        read_DN2=read_DN2,
+        shape=shape,
+        row_DN2=row,
+        dsnu_DN2=DSNU2,
+        white=white,
+        foreign=foreign,
+        skewed=pairs.skewed,
+        unsteady_DN=levels.unsteady_DN,
+        fit=fit,
+        offsets=offsets,
     )
 
 
@@ -145,12 +168,94 @@ def _coded_variances(pairs: tuple[DarkPair, ...], fit: DarkFit, K_DN_per_e: floa
     return found
 
 
+@final
+@dataclass(frozen=True)
+class _Line:
+    """Black and dark current in DN per s: a line through the mean signals of exposures, of which ``left`` is the rest.
+
+    One exposure time does not tell dark current from black: all is black.
+    """
+
+    values: PerPair
+    cov: Float[np.ndarray, "2 2"]
+    left: PerPair
+
+    @classmethod
+    def through(cls, means: PerPair, variances: PerPair, times: PerPair) -> _Line:
+        """Fit it."""
+        design = np.column_stack([np.ones_like(times), times * bool(np.ptp(times) > 0)])
+        cov = scaled_inverse(design.T @ (design / variances[:, None]))
+        values = cov @ (design.T @ (means / variances))
+        return cls(values, cov, means - design @ values)
+
+
+@final
+@dataclass(frozen=True)
+class _Means:
+    """Mean signals of the dark pairs; ``skewed``: those of all pixels, as no distribution has them.
+
+    Otherwise hot pixels outside the histograms have ``hot_DN`` of the mean of all pixels, and ``doubt`` is how far the
+    mean codes would move black and dark current.
+    """
+
+    times_s: PerPair
+    means_DN: PerPair
+    variances_DN2: PerPair
+    hot_DN: PerPair
+    doubt: PerPair
+    skewed: bool = False
+
+    @property
+    def rate_DN_per_s(self) -> float:
+        """Dark current."""
+        return float(_Line.through(self.means_DN, self.variances_DN2, self.times_s).values[1])
+
+
+def _means(data: NoiseMoments, fit: DarkFit, row_DN2: float | None) -> _Means:
+    """By the fit's distribution, unless mean codes are far off: read noise and dark current may have one tail.
+
+    Without ``row_DN2``, mean codes do not tell: rounding bends them.
+    """
+    times = np.array([pair.exposure_s for pair in data.darks])
+    fitted, nothing = (times, fit.means_DN, fit.variances_DN2), np.zeros(len(times))
+    if row_DN2 is None:
+        return _Means(*fitted, nothing, np.zeros(2))
+    codes, dark = np.array([pair.mean_DN for pair in data.darks]), data.dark_moments
+    everywhere = np.array([np.average(of.mean_DN, weights=of.samples) for of in dark])
+    own = np.array([of.temporal_DN2 / (2 * of.pixels) + row_DN2 / (2 * of.height) for of in dark])
+    by_codes = _Line.through(codes, own, times)
+    doubt = by_codes.values - _Line.through(fit.means_DN, fit.variances_DN2, times).values
+    if np.all(np.abs(doubt) <= data.rules.foreign_sigma * np.sqrt(np.diag(by_codes.cov))):
+        return _Means(*fitted, everywhere - codes, doubt)
+    own += [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
+    return _Means(times, everywhere, own, nothing, np.zeros(2), True)
+
+
+@final
+@dataclass(frozen=True)
+class _Levels:
+    """Black and dark current with their covariance, and ``DarkTerms.unsteady_DN``."""
+
+    black_DN: float
+    current: Quantity
+    cov: Float[np.ndarray, "2 2"]
+    unsteady_DN: float
+
+
 def _levels(
-    data: NoiseMoments, fit: DarkFit, row_DN2: float, single_DN2: float, offsets: Pattern, curvature: float
-) -> tuple[float, Float[np.ndarray, "2 2"], Quantity]:
+    data: NoiseMoments,
+    fit: DarkFit,
+    pairs: _Means,
+    white: bool,
+    row_DN2: float,
+    single_DN2: float,
+    offsets: Pattern,
+    curvature: float,
+) -> _Levels:
     """Black and dark current from the mean of every dark exposure, with its own weight."""
-    means, variances, times = fit.means_DN, fit.variances_DN2, np.array([pair.exposure_s for pair in data.darks])
-    if fit.follows:
+    means, variances, times = pairs.means_DN, pairs.variances_DN2, pairs.times_s
+    # The stack's mean is without hot pixels.
+    if fit.follows and not pairs.skewed:
         stack = data.dark_stack
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)
@@ -158,13 +263,17 @@ def _levels(
         own = single_DN2 / stack.frames + data.rounding_DN2 * float(np.exp(-4 * np.pi**2 * single_DN2 / data.q_DN**2))
         variances = np.append(variances, own / stack.mean_DN.size + rows / stack.frames)
     means = means + curvature * np.maximum(means - float(fit.values[0]), 0.0) ** 2
-    # One exposure time does not tell dark current from black: all is black, and all of it may be dark current.
-    apart = bool(np.ptp(times) > 0)
-    design = np.column_stack([np.ones_like(times), times * apart])
-    cov = scaled_inverse(design.T @ (design / variances[:, None]))
-    line = cov @ (design.T @ (means / variances))
-    cov[1, 1] = cov[1, 1] if apart else (line[0] / max(float(times[0]), 1e-6)) ** 2
-    current = Quantity.asked("dark current", float(line[1]), float(cov[1, 1]), data.dark_samples)
+    line, apart, unsteady = _Line.through(means, variances, times), bool(np.ptp(times) > 0), 0.0
+    if white:
+        dof = float(len(times) - 1 - apart)
+        unsteady = excess_sigma(line.left**2, variances, np.ones_like(means), dof)
+        # A few exposures tell the scatter of black only roughly (Student's t).
+        unsteady *= (dof / max(dof - 2, 1)) ** 0.5
+        line = _Line.through(means, variances + unsteady**2, times)
+    cov = line.cov + np.outer(pairs.doubt, pairs.doubt)
+    # All of black may be dark current.
+    cov[1, 1] = cov[1, 1] if apart else (line.values[0] / max(float(times[0]), 1e-6)) ** 2
+    current = Quantity.asked("dark current", float(line.values[1]), float(cov[1, 1]), data.dark_samples)
     by_choice = current.variance - float(cov[1, 1])
     if not fit.follows:
         # With coarse or cut-off codes, the errors of black, spread and noise are common to all pairs.
@@ -174,7 +283,7 @@ def _levels(
         cov[0, 0] += data.rounding_DN2
     cov[1, 1] += by_choice
     # Black stays that of the line: a dark current too weak to be chosen must not shift it.
-    return float(line[0]), cov, current
+    return _Levels(float(line.values[0]), current, cov, unsteady)
 
 
 def unexplained_variance(data: NoiseMoments, expected_DN2: Sequence[float], most_hits: float) -> Quantity:

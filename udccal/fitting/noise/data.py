@@ -44,6 +44,7 @@ class NoiseRules:
         foreign_sigma: read noise whose measured variance is farther from the fitted distribution's, in sigma, has
             none of the family's distributions.
         most_hits: fraction of pixels that radiation hits at most in a dark pair.
+        most_hot: fraction of dark samples that are hot pixels above which a note tells of them.
         worst_chi2: reduced chi-squared above which the sensor is not what the model says.
     """
 
@@ -61,6 +62,7 @@ class NoiseRules:
     gain_sigma: float = 10.0
     foreign_sigma: float = 3.0
     most_hits: float = 1e-4
+    most_hot: float = 1e-3
     worst_chi2: float = 6.0
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import compress
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
@@ -270,6 +270,18 @@ def _outliers(
         yield Outliers(rule, found.outliers, places)
 
 
+def _missing_codes(data: NoiseMoments) -> Int[np.ndarray, " missing"]:
+    """Codes that no flat has although it has many samples of codes on both sides, and noise of some codes."""
+    near, missing = 8, np.zeros(0, int)
+    for flat in data.flats:
+        if float(flat.variance_DN2.min()) > (0.5 * near * data.q_DN) ** 2:
+            codes = np.pad(flat.codes[:: data.q_DN], near)
+            most = np.lib.stride_tricks.sliding_window_view(codes, near).max(axis=1)
+            beside = np.minimum(most[: -near - 1], most[near + 1 :])
+            missing = np.union1d(missing, np.flatnonzero((codes[near:-near] == 0) & (beside >= 100)) * data.q_DN)
+    return missing
+
+
 def _notes(
     data: NoiseMoments,
     dark: DarkTerms,
@@ -292,14 +304,35 @@ def _notes(
         yield f"{found} That counts as light, as a panel's; columns or blotches of the sensor are not in PRNU1288."
     if dark.foreign:
         yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
+    if dark.skewed:
+        yield (
+            "Read noise or dark current has one tail, which the model's has not: black and dark current are those of "
+            "the mean code of all pixels."
+        )
+    if dark.unsteady_DN:
+        found = f"The mean of dark frames is off black and dark current by {dark.unsteady_DN:.2g} DN"
+        yield f"{found} from exposure to exposure; the sigmas of black, dark current and saturation include that."
+    size = data.flat_stack.mean_DN.size
+    hot = max(1 - data.dark_samples / (len(data.darks) * size), dark.offsets.outliers / size)
+    if hot > data.rules.most_hot:
+        without = "DSNU is that" if dark.skewed else "black, dark current and DSNU are those"
+        yield f"{100 * hot:.2g} % of dark samples are far from the others (hot pixels): {without} of the others."
+    if len(missing := _missing_codes(data)):
+        yield (
+            f"{len(missing)} codes between others never occur (the first is {missing[0]}): the converter's steps are "
+            "uneven, and noise of a few codes, black and saturation are those of its codes."
+        )
     if (test := curve.fit.misfit).found:
         found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
         yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
+        yield "PRNU1288 holds for the photon transfer curve as fitted, which the variances do not follow."
     if curve.fit.order.curved:
         yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."
     if bent_too_far:
         yield "The response bends more than the model can describe. Check the exposures and the lamp."
     if curve.fit_up_to < 0.9:
         yield f"Flats above {100 * curve.fit_up_to:.0f} % of saturation do not follow the curve and are left out."
+        if rough_median(data.flat_stack.mean_DN) - dark.black_DN > curve.fit_up_to * (curve.ceiling_DN - dark.black_DN):
+            yield "The flat stack is brighter than that: PRNU1288 holds for a curve that goes on."
     if curve.fit.order.unsteady:
         yield f"The light differs by {100 * curve.fit.scatter:.2g} % from level to level."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
@@ -40,6 +40,7 @@ class Curve:
     inside: Levels
     levels: Levels
     choice: Choice[TransferFit] | None
+    apart: Five = field(default_factory=lambda: np.zeros(5))
 
     @property
     def fit(self) -> TransferFit:
@@ -57,7 +58,7 @@ class Curve:
         """Covariance of the values, with what the variances' misfit and the choice of an order add."""
         assert self.choice is not None, "asked for where there are usable levels"
         orders = self.choice.spread(self.fit.samples, lambda of: of.values)
-        return np.asarray(self.fit.cov * self.fit.misfit.inflation + orders)
+        return np.asarray(self.fit.cov * self.fit.misfit.inflation + orders + np.outer(self.apart, self.apart))
 
     @property
     def usable_levels(self) -> int:
@@ -84,10 +85,13 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
         return replace(empty, levels=levels, choice=choice)
 
     found = up_to(rules.fit_up_to)
-    if found.choice and found.fit.misfit.ratio > 2:
-        narrow = up_to(rules.narrow_up_to)
-        if narrow.usable_levels >= rules.levels and narrow.fit.misfit.ratio < 0.5 * found.fit.misfit.ratio:
-            return narrow
+    parts = [part for part in (rules.narrow_up_to, 0.5 * rules.fit_up_to) if found.choice and found.fit.misfit.found]
+    for part in parts:
+        narrow = up_to(part)
+        if narrow.usable_levels < rules.levels:
+            break
+        far_better = found.fit.misfit.ratio > 2 and narrow.fit.misfit.ratio < 0.5 * found.fit.misfit.ratio
+        found = narrow if far_better else replace(found, apart=narrow.values - found.values)
     return found
 
 
@@ -168,7 +172,8 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
         # Frames that are lit have an exposure: 0 says that it is not known.
         light=np.array([flat.light or np.nan for flat in flats]),
         dark_DN=dark.dark_DN_per_s.value * np.array([flat.exposure_s for flat in flats]),
-        row_variance_DN2=np.array([dark.row_DN2.value / (flat.frames * flat.height) for flat in flats]),
+        row_variance_DN2=np.array([dark.row_DN2.value / (flat.frames * flat.height) for flat in flats])
+        + dark.unsteady_DN**2,
     )
 
 
@@ -185,7 +190,10 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
         # The tails are the read noise's: rounding and counts of dark current have hardly any.
         tails = excess_kurtosis(dark.shape.value) * min(read.value, seen.temporal_DN2) ** 2 * (1 - 1 / seen.frames)
         sigma = float(np.sqrt((2 * seen.temporal_DN2**2 + tails) / float(seen.dof.sum())))
-        points.append((seen.temporal_DN2 - rounding - K * rate * seen.exposure_s, sigma, rate * seen.exposure_s))
+        # Hot pixels, which are not in the dark current unless it is skewed, have shot noise, too.
+        hot = 0.0 if dark.skewed else float(np.average(seen.mean_DN, weights=seen.samples)) - dark.offsets.mean
+        signal = rate * seen.exposure_s + hot
+        points.append((seen.temporal_DN2 - rounding - K * signal, sigma, signal))
     values, sigmas, drifts = np.array(points).T
     # An error of black acts on the curve as an error of V0 that is K times as large.
     shifted = K * np.sqrt(float(dark.levels_cov[0, 0]))
@@ -271,4 +279,14 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
     # Where some pixels are not full, the possible shift of the mean adds to it.
     low = 0.0 if sure.any() else 0.5 * max(float(excess[chosen].mean()), 0.0)
     level = float(np.average(mean[chosen], weights=weights)) + lost
-    return level, math.sqrt(temporal / count + rounding + low + rows + lost**2)
+    # Dead pixels, and those of a bin's dim end that are not full, lower its mean: by no more than they do that of the
+    # whole frame, and than they widen the bin if each is five sigma short or more.
+    short, reach = 0.0, 5 * math.hypot(spread, q)
+    wider = np.maximum(stacked(flats, "spread_DN") ** 2 - spread2 - data.rounding_DN2, 0.0) / reach
+    for of, bins, wide in zip(flats, chosen, wider, strict=True):
+        if bins.any():
+            lack = np.maximum(level - np.arange(len(of.codes)), 0.0)
+            frame = float(of.codes @ (lack * (lack > reach))) / float(of.codes.sum())
+            short = max(short, frame if bins.all() else min(frame, float(wide[bins].max())))
+    sigma2 = temporal / count + rounding + low + rows + lost**2 + short**2 + dark.unsteady_DN**2
+    return level, math.sqrt(sigma2)

@@ -38,7 +38,7 @@ class Levels:
 
     ``mean_DN`` is above black, ``variance_DN2`` temporal with ``dof``, ``samples`` are frames times pixels, ``usable``
     are bins safely inside the range of the sensor, and ``light`` is the relative exposure to light, nan where unknown.
-    ``dark_DN`` is each level's dark signal, and ``row_variance_DN2`` the variance of its mean by row noise.
+    ``dark_DN`` is each level's dark signal, and ``row_variance_DN2`` the variance of its mean by row noise and black.
     """
 
     mean_DN: Grid

@@ -1,0 +1,121 @@
+"""Sensors outside the model: what a fit says of them holds, or a note names what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.scenes.noise import PLAIN, captured, errors_in_sigma, measure
+from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack
+from udccal.fitting.noise.fit import fit_noise
+from udccal.models.noise import Noise
+from udccal.result import FitResult, FitStatus
+
+SENSOR = replace(PLAIN, rows=144, columns=192, row_DN=0.0)
+SHAPE = (SENSOR.rows, SENSOR.columns)
+
+
+def changed(data: NoiseData, change: Callable[[np.ndarray, int], np.ndarray]) -> NoiseData:
+    """Every frame replaced by a function of its codes and its number."""
+    number = iter(range(10_000))
+
+    def new(frames: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+        return tuple(change(frame.astype(int), next(number)).astype(np.uint16) for frame in frames)
+
+    levels = [ExposureLevel(of.exposure_s, new(of.dark), new(of.bright)) for of in data.levels]
+    assert data.stack is not None
+    stack = SpatialStack(data.stack.exposure_s, new(tuple(data.stack.dark)), new(tuple(data.stack.bright)))
+    return NoiseData(levels, stack, top_code=data.top_code)
+
+
+def z(result: FitResult[Noise], name: str, truth: float) -> float:
+    one = result.estimate(name)
+    return (one.value - truth) / one.sigma
+
+
+def noted(result: FitResult[Noise], words: str) -> bool:
+    return any(words in note for note in result.notes)
+
+
+@pytest.mark.parametrize("shape", [2.0, 0.5])
+def test_dark_current_that_differs_from_pixel_to_pixel_is_its_mean(shape: float) -> None:
+    """Long exposures scatter more than short ones. That was taken for codes cut off: 17 sigma off, and DSNU 100."""
+    uneven = np.random.default_rng(4).gamma(shape, 1 / shape, SHAPE)
+    result = measure(replace(SENSOR, dark_pattern=uneven / uneven.mean()), 3)
+    assert result.status is FitStatus.CONVERGED
+    assert noted(result, "one tail")
+    assert not noted(result, "cut-off")
+    for name, truth in (("K_DN_per_e", 0.36), ("black_DN", 64.0), ("dark_current_e_per_s", 40.0), ("sigma_d_e", 4.0)):
+        assert abs(z(result, name, truth)) < 4.5, name
+
+
+def test_hot_pixels_are_told_and_have_no_part_in_the_read_noise() -> None:
+    hot = np.where(np.random.default_rng(5).random(SHAPE) < 0.01, 50.0, 1.0)
+    result = measure(replace(SENSOR, dark_pattern=hot), 3)
+    assert noted(result, "far from the others (hot pixels)")
+    for name, truth in (("black_DN", 64.0), ("dark_current_e_per_s", 40.0), ("sigma_d_e", 4.0)):
+        assert abs(z(result, name, truth)) < 4.5, name
+
+
+def test_a_glow_in_one_corner_is_part_of_the_dark_current() -> None:
+    down, across = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    glow = 1 + 50 * np.exp(-(down**2 + across**2) / 30**2)
+    result = measure(replace(SENSOR, dark_pattern=glow), 3)
+    assert noted(result, "one tail")
+    assert abs(z(result, "dark_current_e_per_s", 40 * float(glow.mean()))) < 4.5
+    assert abs(z(result, "black_DN", 64.0)) < 4.5
+
+
+def test_black_is_the_mean_of_skewed_read_noise() -> None:
+    """A symmetric distribution has its middle elsewhere: 25 sigma off."""
+    sensor = replace(SENSOR, other_noise=lambda rng, size: rng.exponential(size=size) - 1)
+    result = measure(sensor, 3)
+    assert noted(result, "one tail")
+    assert abs(z(result, "black_DN", 64.0)) < 4.5
+    assert not noted(measure(SENSOR, 3), "one tail")
+
+
+def test_a_black_level_that_moves_is_told_and_in_the_sigmas() -> None:
+    """Dark current was 54 sigma off where black falls with the exposure, and black 64 where it jumps."""
+    jumps = 0.8 * np.random.default_rng(6).standard_normal(100)
+    sensor = replace(SENSOR, K_DN_per_e=1.5, bits=14)
+    result = fit_noise(changed(captured(sensor, 3), lambda codes, k: codes + int(np.rint(2 * jumps[k]))))
+    assert noted(result, "from exposure to exposure")
+    for name, truth in (("dark_current_e_per_s", 40.0), ("black_DN", 64.0), ("saturation_DN", 15064.0)):
+        assert abs(z(result, name, truth)) < 4.5, name
+    assert not noted(measure(sensor, 3), "from exposure to exposure")
+
+
+@pytest.mark.parametrize("change", [lambda codes, _: codes | 4, lambda codes, _: codes + (codes % 8 == 3)])
+def test_codes_that_never_occur_are_told(change: Callable[[np.ndarray, int], np.ndarray]) -> None:
+    assert noted(fit_noise(changed(captured(SENSOR, 3), change)), "never occur")
+    assert not noted(measure(SENSOR, 3), "never occur")
+
+
+def test_saturation_is_that_of_full_pixels() -> None:
+    """Of a flat that a lens shades by 30 % the corners are not full, and 0.06 DN were 10 sigma."""
+    down, across = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    shaded = -0.15 * ((down / 72 - 1) ** 2 + (across / 96 - 1) ** 2)
+    assert abs(z(measure(replace(SENSOR, pattern=shaded), 3), "saturation_DN", 3664.0)) < 4.5
+    alive = np.indices(SHAPE).sum(axis=0) % 97 > 0
+    dead = fit_noise(changed(captured(SENSOR, 3), lambda codes, _: codes * alive))
+    assert abs(z(dead, "saturation_DN", 3664.0)) < 4.5
+    assert measure(SENSOR, 3).estimate("saturation_DN").sigma < 0.01
+
+
+def test_a_response_that_bends_otherwise_has_its_gain_within_sigma() -> None:
+    """It bends with the third power: the quadratic that is fitted was 8 sigma off at small signals."""
+    sensor = replace(SENSOR, K_DN_per_e=1.5, bits=14)
+
+    def bent(codes: np.ndarray, _: int) -> np.ndarray:
+        part = (codes - 64) / 15_000
+        return np.rint(codes - 1500 * part**3).astype(int)
+
+    result = fit_noise(changed(captured(sensor, 3), bent))
+    assert result.status is FitStatus.CONVERGED
+    assert abs(z(result, "K_DN_per_e", 1.5)) < 4.5
+    assert abs(z(result, "sigma_d_e", 4.0)) < 4.5
+    assert max(abs(errors_in_sigma(measure(sensor, 3), sensor))) < 4.5
