@@ -10,7 +10,7 @@ import pytest
 
 from udccal.errors import FitError
 from udccal.fitting.hdr.likelihood import HdrRules, SensorNumbers, merge_block
-from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, merge_bracket
+from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, HdrMerge, merge_bracket
 from udccal.fitting.psf.data import PsfData
 from udccal.fitting.psf.fit import _notes as psf_notes
 from udccal.models.noise import Noise
@@ -317,3 +317,48 @@ def test_two_frames_that_differ_are_told_where_no_third_decides() -> None:
     decided = merge_bracket(three, np.append(exposures, EXPOSURES[4]), NOISE)
     assert [o.places for o in decided.outliers] == [("frame 1",)]
     assert decided.status is FitStatus.CONVERGED
+
+
+# Frames whose pixels have light of three decades.
+TIMES, RATES = 1e-3 * 3.0 ** np.arange(5), np.geomspace(300.0, 3e5, 12_000).reshape(100, 120)
+
+
+def merged_light(lamp: np.ndarray, bend: float = 0.0, moved: bool = False, told: Noise = NOISE) -> HdrMerge:
+    """A bracket whose frames have the light ``lamp``, with a part ``bend`` missing at saturation."""
+    rng, full = np.random.default_rng(71), (3960.0 - 64.3) / 0.355
+    scene = rng.permuted(RATES.ravel()).reshape(RATES.shape)
+    frames = []
+    for k, (time, light) in enumerate(zip(TIMES, lamp, strict=True)):
+        here = 0.7 * scene + 0.3 * np.roll(scene, 1, axis=1) if moved and k % 2 else scene
+        counts = rng.poisson((here * light + 20.0) * time).astype(float)
+        counts = np.minimum(counts * (1 - bend * counts / full), full) + 4.5 * rng.standard_normal(scene.shape)
+        frames.append(np.clip(np.rint(64.3 + 0.355 * counts), 0, 4095))
+    return merge_bracket(np.array(frames, np.uint16), TIMES, told)
+
+
+@pytest.mark.parametrize("bend", [0.02, 0.05, -0.03])
+def test_a_response_that_bends_is_told(bend: float) -> None:
+    """Bright light is off by 1.5 sigma of every pixel; a bend that the noise model has is taken out."""
+    wrong = merged_light(np.ones(5), bend)
+    assert wrong.status is FitStatus.POOR_FIT
+    (note,) = (one for one in wrong.notes if "response bends" in one)
+    assert float(note.split("off by ")[1].split(" %")[0]) == pytest.approx(-100 * bend, abs=0.8)
+    # ``nonlinearity`` is the part of the signal that the quadratic takes from the linear one.
+    if bend == 0.02:
+        assert merged_light(np.ones(5), bend, told=replace(NOISE, nonlinearity=bend)).status is FitStatus.CONVERGED
+    assert not merged_light(np.ones(5)).notes
+
+
+def test_light_that_differs_a_little_is_told() -> None:
+    merged = merged_light(np.array([1, 1, 1, 1, 0.985]))
+    assert merged.status is FitStatus.CONVERGED
+    (note,) = merged.notes
+    assert "light of frame 4 differs by -1.5 %" in note
+    assert not merged_light(np.array([1, 1, 1, 1, 0.999])).notes
+
+
+def test_a_bracket_of_which_most_frames_are_left_out_is_in_doubt() -> None:
+    """Every other frame is three tenths of a pixel aside: the two that agree are not the truth."""
+    merged = merged_light(np.ones(5), moved=True)
+    assert merged.status is FitStatus.POOR_FIT
+    assert any("few that agree are left" in note for note in merged.notes)

@@ -49,6 +49,8 @@ class HdrRules:
         scatter_off: scatter of samples about their light, relative to the noise model's variance, that is too much.
         sure_electrons: electrons that a pixel's light is worth before the scatter about it is judged.
         black_off: error of the black level, in sigma of dark noise, that is too much.
+        bend_off: part of the signal at saturation, missing against shorter exposures, that is too much.
+        light_off: light of a frame that is off, in sigma of a full pixel, of which a note tells.
         least_codes: codes above black from which neighbouring samples are rounded up as often as down: their light
             differs by parts of a code, and its own noise smears the steps.
     """
@@ -61,6 +63,8 @@ class HdrRules:
     scatter_off: float = 0.05
     sure_electrons: float = 100.0
     black_off: float = 0.1
+    bend_off: float = 0.01
+    light_off: float = 0.25
     least_codes: float = 2.0
 
 

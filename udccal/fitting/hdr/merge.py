@@ -87,13 +87,14 @@ def merge_bracket(
         merged = bracket.merged()
     hits = bracket.mend_hits(merged)
     doubts = list(bracket.doubts(merged, unlike))
+    remarks = [] if doubts else list(bracket.unsteady(merged))
     # In place: copies of a full frame would cost as much as a third of the merging.
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
     unknown = merged.used == 0
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
-    notes += doubts
+    notes += [*doubts, *remarks]
     rounded_below = 0.0
     if sensor.rounded_below_e > 0:
         rounded_below = float(sensor.rounded_below_e) / float(times[~bracket.dropped[:, 0]].max())
@@ -204,10 +205,10 @@ class _Bracket:
             left[i] = rest._frame_scores(rest.merged(), self.rules.least_to_judge - 1, 10.0).max()
         return np.argsort(left)[: max(1, int(np.sum(left <= self.rules.frame_sigma)))]
 
-    def _samples(self, merged: BlockMerge, least: int, least_rate: float = 0.0) -> _Samples:
-        """Of some pixels with more than ``least_rate`` and at least so many samples."""
+    def _samples(self, merged: BlockMerge, least: int, least_rate: float = 0.0, most: int = 20_000) -> _Samples:
+        """Of some pixels, about ``most``, with more than ``least_rate`` and at least so many samples."""
         sensor, pixels = self.sensor, np.flatnonzero((merged.used >= least) & (merged.rate > least_rate))
-        pixels = pixels[:: max(1, len(pixels) // 20_000)]
+        pixels = pixels[:: max(1, len(pixels) // max(min(most, 20_000), 1))]
         light = np.asarray(sensor.electrons(self.codes[:, pixels].astype(np.float64)))
         times = self.times[:, None].astype(np.float64)
         signal = merged.rate[pixels] * times
@@ -217,19 +218,54 @@ class _Bracket:
         clear = ~self.dropped & (mean + 5 * np.sqrt(variance) < sensor.level_e)
         return _Samples(times, light - mean, mean, signal, variance, weight, clear)
 
-    def _frame_scores(self, merged: BlockMerge, least: int, bright: float) -> Float[np.ndarray, " n"]:
-        """How far each frame's light is off that of all, in sigma; 0 where that is little or unknown.
+    def _frames_light(
+        self, merged: BlockMerge, least: int, bright: float
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """How far each frame's light is off that of all, of itself, with its sigma; 0 and infinite where unknown.
 
         It is seen in samples of ``bright`` sigma and more, of pixels with at least so many samples.
         """
-        seen, score = self._samples(merged, least), np.zeros(len(self.times))
+        seen, off, sigma = self._samples(merged, least), np.zeros(len(self.times)), np.full(len(self.times), np.inf)
         clear = seen.clear & (bright * np.sqrt(seen.variance) < seen.signal)
         for i in np.flatnonzero(clear.sum(axis=1) >= 8):
-            frame = (np.arange(len(score)) == i)[:, None]
+            frame = (np.arange(len(off)) == i)[:, None]
             left = seen.left(frame * seen.signal, seen.weight)
-            off, sigma = seen.amount(left, clear, self.rules.believed_sigma)
-            score[i] = abs(off) / sigma if abs(off) > self.rules.frame_off else 0.0
-        return score
+            off[i], sigma[i] = seen.amount(left, clear, self.rules.believed_sigma)
+        return off, sigma
+
+    def _frame_scores(self, merged: BlockMerge, least: int, bright: float) -> Float[np.ndarray, " n"]:
+        """The same in sigma; 0 where it is little."""
+        off, sigma = self._frames_light(merged, least, bright)
+        return np.where(np.abs(off) > self.rules.frame_off, np.abs(off) / sigma, 0.0)
+
+    def _bend(self, merged: BlockMerge) -> float:
+        """Part of the signal that is missing at saturation, whatever the light of each frame; 0 where it is little."""
+        count = len(self.times)
+        seen = self._samples(merged, 2, most=2_000_000 // count**2)
+        clear = seen.clear & (3.0 * np.sqrt(seen.variance) < seen.signal)
+        frames = np.eye(count)[:, :, None] * seen.signal
+        causes = (*frames, -(seen.signal**2) / float(self.sensor.level_e))
+        left = np.stack([seen.left(cause, seen.weight)[clear] for cause in causes])
+        errors, sigma = seen.errors[clear], np.sqrt(seen.variance[clear])
+        left, errors = left / sigma, np.clip(errors / sigma, -self.rules.believed_sigma, self.rules.believed_sigma)
+        size = np.maximum(np.sqrt(np.sum(left**2, axis=1)), 1e-30)
+        # All frames together have the light of the pixels, which is not known otherwise.
+        cov = np.linalg.pinv((left / size[:, None]) @ (left / size[:, None]).T, rcond=1e-9, hermitian=True)
+        found, own = float((cov @ (left @ errors / size))[-1] / size[-1]), float(np.sqrt(cov[-1, -1])) / float(size[-1])
+        # The light of few electrons hardly tells it, and is itself too uncertain.
+        known = 0 < 2 * own < self.rules.bend_off
+        return found if known and abs(found) > max(self.rules.bend_off, self.rules.frame_sigma * own) else 0.0
+
+    def unsteady(self, merged: BlockMerge) -> Iterator[str]:
+        """A sentence for light that differs between frames by too little to leave one out."""
+        off, sigma = self._frames_light(merged, 2, 3.0)
+        worst = int(np.argmax(np.abs(off) / sigma))
+        least = self.rules.light_off * float(self.sensor.level_e) ** -0.5
+        if abs(off[worst]) > max(least, self.rules.frame_sigma * sigma[worst]):
+            yield (
+                f"The light of frame {worst} differs by {100 * off[worst]:+.2g} % from that of the others: rates may "
+                "be off by as much, which their sigma does not include."
+            )
 
     def mend_hits(self, merged: BlockMerge) -> Int[np.ndarray, " hits"]:
         """Leave out the worst sample of a pixel while it is too far off; changes ``merged``, returns the pixels."""
@@ -262,6 +298,15 @@ class _Bracket:
                 "of this gain and temperature; the light of dark pixels is not to be trusted."
             )
         advice = "Check their exposure times, or take exposures that lie closer together."
+        lost = np.flatnonzero(self.dropped.all(axis=1))
+        if len(lost) > 1 and 2 * len(lost) > len(self.times) - len(lost):
+            frames = f"frames {', '.join(map(str, lost))} of {len(self.times)}"
+            yield f"The light of {frames} differs, and few that agree are left. Check light, scene, times, black."
+        elif not black_DN and (bend := self._bend(merged)):
+            yield (
+                f"Light near saturation is off by {-100 * bend:+.2g} % of that in shorter exposures: the response "
+                "bends otherwise than the noise model's. Fit the noise with frames of this sensor."
+            )
         if unlike.size:
             frames = f"frames {' and '.join(map(str, unlike))} differs, and no other frame tells which one is right"
             yield f"The light of {frames}: frame {unlike[0]} is left out. {advice}"
