@@ -191,3 +191,21 @@ def test_sigmas_hold_whether_a_lens_has_a_coefficient_or_not(far: dict[str, Any]
         z.append(off / np.sqrt(np.diag(found.cov)[: len(off)]))
     assert np.abs(z).max() < 4.5
     assert (np.sqrt(np.mean(np.square(z), axis=0)) < 1.4).all()
+
+
+def test_pictures_that_are_given_twice_do_not_count_twice(plain: CalibratedViews) -> None:
+    """Copies that a codec has changed by a thousandth of a pixel: k3 was 5 sigma off, and a lens was blamed."""
+    board, image, sigma = arrays()
+    rng = np.random.default_rng(3)
+    copied = [view + 1e-3 * rng.standard_normal(view.shape) for view in image for _ in range(4)]
+    four = [[part for part in parts for _ in range(4)] for parts in (board, sigma)]
+    found = calibrated(four[0], copied, SCENE.size, sigmas=four[1])
+    (left_out,) = (one for one in found.outliers if "repeats another's corners" in one.rule)
+    assert left_out.count == 3 * len(image)
+    assert found.cov[0, 0] == pytest.approx(plain.cov[0, 0], rel=0.05)
+    # Pictures of a board at rest, with noise of their own, are measurements.
+    again = [part + s[:, None] * rng.standard_normal(part.shape) for part, s in zip(image, sigma, strict=True)]
+    twice = calibrated([*board, *board], [*image, *again], SCENE.size, sigmas=[*sigma, *sigma])
+    assert not any("repeats" in one.rule for one in twice.outliers)
+    with pytest.raises(FitError, match="at least 3 different views, found 2, and 6 that repeat them"):
+        calibrated(four[0][:8], copied[:8], SCENE.size, sigmas=four[1][:8])

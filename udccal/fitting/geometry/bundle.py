@@ -48,6 +48,8 @@ class GeometryRules:
         corners: which corners are left out, by their view's own scatter.
         strange_view: a view is left out whole when it scatters this many times as much as the median view.
         loud_view: a view is mentioned when it scatters this many times as much.
+        copy: a view is a copy of another when their corners differ by less than this part of the variance that
+            independent errors give; it is left out.
         further_order: prior odds against each further order of the distortion: a coefficient that is not needed raises
             the sigma of the others.
         prior_share: beyond this part of the information on focal length or centre, the prior chooses the order.
@@ -74,6 +76,7 @@ class GeometryRules:
     corners: OutlierRule = field(default_factory=lambda: OutlierRule("corners"))
     strange_view: float = 20.0
     loud_view: float = 3.0
+    copy: float = 0.25
     further_order: float = 10.0
     prior_share: float = 0.1
     most_uncertain: float = 0.05

@@ -68,12 +68,20 @@ def calibrate_views(
             f"{' '.join(gathered.notes)} Capture more views of the board."
         )
     robust = _Search(given, known, rules).best_of(starts(given, image_size, start, start_poses))
-    strange = robust.scales > rules.strange_view * np.median(robust.scales)
-    if strange.any() and (~strange).sum() >= least:
-        rule = f"of a view that scatters more than {rules.strange_view:g} times as much as the median view"
-        left_out = (*left_out, *outliers(rule, (f"view {given.names[k]}" for k in np.flatnonzero(strange))))
-        given = given.without(strange)
-        robust = _Search(given, known, rules).best_of(starts(given, image_size, start, start_poses))
+    scatters = f"scatters more than {rules.strange_view:g} times as much as the median view"
+    repeats = "repeats another's corners to within a fraction of their scatter: it is no new measurement"
+    for judged, what in ((_strange, scatters), (_copies, repeats)):
+        out = judged(robust, rules, least)
+        if out.any():
+            names = (f"view {given.names[k]}" for k in np.flatnonzero(out))
+            left_out = (*left_out, *outliers(f"of a view that {what}", names))
+            given = given.without(out)
+            if len(given.names) < least:
+                raise FitError(
+                    f"Expected at least {least} different views, found {len(given.names)}, and {int(out.sum())} that "
+                    "repeat them. Move the board between pictures."
+                )
+            robust = _Search(given, known, rules).best_of(starts(given, image_size, start, start_poses))
     likely = _scaled(robust, replace(given, used=robust.points.used), EVERY, known)
     orders, between = _choose_order(likely, known, rules)
     free = ORDERS[orders.best.name]
@@ -198,6 +206,28 @@ class _Search:
         scales = np.maximum(np.maximum(own, 0.5 * robust_sigma(seen)), _least_scale(self.given))
         off = self.rules.corners.off(z / scales[view, None]).any(axis=1)
         return scales, ~off | (np.bincount(view[~off], minlength=views) < self.rules.least_corners)[view]
+
+
+def _strange(robust: _Fitted, rules: GeometryRules, least: int) -> Bool[np.ndarray, " views"]:
+    """Views that scatter far more than the others, unless too few would be left."""
+    strange = robust.scales > rules.strange_view * np.median(robust.scales)
+    return np.asarray(strange & bool((~strange).sum() >= least))
+
+
+def _copies(robust: _Fitted, rules: GeometryRules, _: int) -> Bool[np.ndarray, " views"]:
+    """Views that repeat an earlier one: the errors of a picture that is given twice are no independent ones."""
+    points, views = robust.points, len(robust.points.names)
+    used = [np.flatnonzero((points.view == view) & points.used) for view in range(views)]
+    corners = [{tuple(points.board[k]): k for k in mine} for mine in used]
+    copies = np.zeros(views, bool)
+    for later in range(views):
+        for first in np.flatnonzero(~copies[:later]):
+            common = corners[later].keys() & corners[first].keys()
+            pairs = np.array([(corners[later][at], corners[first][at]) for at in common]).reshape(-1, 2).T
+            apart2 = ((points.image[pairs[0]] - points.image[pairs[1]]) ** 2).mean(axis=1)
+            alike = apart2.sum() < rules.copy * np.sum(points.sigma[pairs] ** 2)
+            copies[later] |= len(common) >= rules.least_corners and bool(alike)
+    return copies
 
 
 def costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
