@@ -58,6 +58,9 @@ def test_hot_pixels_are_told_and_have_no_part_in_the_read_noise() -> None:
     assert noted(result, "far from the others (hot pixels)")
     for name, truth in (("black_DN", 64.0), ("dark_current_e_per_s", 40.0), ("sigma_d_e", 4.0)):
         assert abs(z(result, name, truth)) < 4.5, name
+    # With codes as coarse as twice the read noise, flats alone show the hot pixels' offsets.
+    coarse = measure(replace(SENSOR, dark_pattern=hot, K_DN_per_e=0.1, read_e=1.5), 3)
+    assert noted(coarse, "hot pixels, which rounding hides")
 
 
 def test_a_glow_in_one_corner_is_part_of_the_dark_current() -> None:

@@ -317,6 +317,8 @@ def _notes(
     if hot > data.rules.most_hot:
         without = "DSNU is that" if dark.skewed else "black, dark current and DSNU are those"
         yield f"{100 * hot:.2g} % of dark samples are far from the others (hot pixels): {without} of the others."
+        if not dark.white:
+            yield "PRNU1288 is what is left without that DSNU: offsets of hot pixels, which rounding hides, are in it."
     if len(missing := _missing_codes(data)):
         yield (
             f"{len(missing)} codes between others never occur (the first is {missing[0]}): the converter's steps are "
