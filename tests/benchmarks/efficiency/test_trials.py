@@ -42,6 +42,13 @@ def test_a_wasteful_biased_or_dishonest_fit_does_not(bad: Trials) -> None:
     assert not figure(bad).ok
 
 
+def test_one_fit_that_is_far_off_does_not_hide_in_the_standard_errors_that_it_widens() -> None:
+    sound = _draw()
+    sound.error[7] = 30.0
+    assert not figure(sound).ok
+    assert figure(sound).z_worst == 30.0
+
+
 def test_places_that_share_their_noise_do_not_count_as_many() -> None:
     alone, apart = figure(_draw(places=50, shared=0.99)), figure(_draw(places=50))
     assert alone.efficiency_error > 5 * apart.efficiency_error
@@ -76,6 +83,6 @@ def test_table_and_file_show_what_was_missed(tmp_path: Path) -> None:
     assert table(figures).count("**missed**") == 1
     write_json(figures, tmp_path / "efficiency.json")
     kept = json.loads((tmp_path / "efficiency.json").read_text())
-    names = ["efficiency", "efficiency_error", "name", "of_all", "ok", "truths", "z_mean", "z_std"]
+    names = ["efficiency", "efficiency_error", "name", "of_all", "ok", "truths", "z_mean", "z_std", "z_worst"]
     assert [sorted(one) for one in kept] == [names] * 2
     assert [one["ok"] for one in kept] == [True, False]

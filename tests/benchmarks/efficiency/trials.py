@@ -15,6 +15,8 @@ MOST_OVER_BOUND = 1.10
 MEAN_BAND, STD_BAND = 0.15, 0.10
 # Offsets that only very many realisations resolve and that nobody can notice: a fifth of the bands.
 _UNNOTICED = 0.2
+# No z-score is beyond this: one fit that is far off widens the standard errors above, in which it hides.
+WORST_Z = 6.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Figure:
 
     ``efficiency`` is the bound over the mean squared error (1: all information in the used data), with its standard
     error; ``of_all`` the same with the bound of all captured data, which is what users get; None where it is not known.
-    ``z_mean`` and ``z_std`` are of (estimate - truth) / sigma.
+    ``z_mean``, ``z_std`` and the largest size ``z_worst`` are of (estimate - truth) / sigma.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Figure:
     of_all: float | None
     z_mean: float
     z_std: float
+    z_worst: float
     truths: int
     ok: bool
 
@@ -86,15 +89,17 @@ def figure(trials: Trials) -> Figure:
     mean, square = _by_truth(trials, z), _by_truth(trials, z**2)
     z_mean, mean_error = float(mean.mean()), float(mean.std(ddof=1) / np.sqrt(count))
     z_std = float(np.sqrt(max(square.mean() - z_mean**2, 0.0)))
+    z_worst = float(np.abs(z).max())
     std_error = float(square.std(ddof=1) / np.sqrt(count) / (2 * max(z_std, 1e-9)))
     ok = (
         bool(np.isfinite([over, z_mean, z_std]).all())
+        and z_worst <= WORST_Z
         and over - 2 * over_error <= MOST_OVER_BOUND
         and _near(z_mean, 0.0, mean_error, MEAN_BAND)
         and _near(z_std, 1.0, std_error, STD_BAND)
     )
     of_all = 1 / over_all if np.isfinite(over_all) else None
-    return Figure(trials.name, 1 / over, over_error / over**2, of_all, z_mean, z_std, count, ok)
+    return Figure(trials.name, 1 / over, over_error / over**2, of_all, z_mean, z_std, z_worst, count, ok)
 
 
 def _by_truth(trials: Trials, of: Float[np.ndarray, "realisations places"]) -> Float[np.ndarray, " truths"]:
@@ -114,18 +119,18 @@ def _near(value: float, wanted: float, error: float, band: float) -> bool:
 def table(figures: list[Figure]) -> str:
     """The figures as a Markdown table."""
     head = [
-        "| quantity | efficiency | of all data | z mean | z std | truths | |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | --- |",
+        "| quantity | efficiency | of all data | z mean | z std | worst z | truths | |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |",
     ]
     body = [
         f"| {f.name} | {f.efficiency:.3f} ± {f.efficiency_error:.3f} | "
         f"{'–' if f.of_all is None else f'{f.of_all:.3f}'} | {f.z_mean:+.3f} | "
-        f"{f.z_std:.3f} | {f.truths} | {'ok' if f.ok else '**missed**'} |"
+        f"{f.z_std:.3f} | {f.z_worst:.1f} | {f.truths} | {'ok' if f.ok else '**missed**'} |"
         for f in figures
     ]
     return "\n".join(head + body)
 
 
 def write_json(figures: list[Figure], path: Path) -> None:
-    """``efficiency.json``: a list of {name, efficiency, efficiency_error, of_all, z_mean, z_std, truths, ok}."""
+    """``efficiency.json``: a list of the figures, each as its fields by name."""
     path.write_text(json.dumps([asdict(f) for f in figures], indent=1) + "\n", encoding="utf-8")
