@@ -191,7 +191,8 @@ def test_the_picture_does_not_outlive_the_program(screen: VirtualScreen) -> None
             assert screen.pixels().min() == 200
         finally:
             process.kill()
-        assert eventually(lambda: screen.pixels().max() == 0)
+        # Nothing but the pointer is seen then.
+        assert eventually(lambda: (screen.pixels() == 0).mean() > 0.99)
 
 
 def test_a_dead_screen_is_an_error(screen: VirtualScreen) -> None:
