@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 
 import numpy as np
 
@@ -12,14 +11,12 @@ from tests.benchmarks.robust.family import Answer, Case, Family, Number, of_resu
 from tests.fitting.geometry.boards import Sight, sight
 from tests.scenes.information import fisher_information
 from udccal.fitting.engine.gaussian import cramer_rao
-from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS
+from udccal.fitting.geometry.bundle import LENS, Intrinsics
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.fit import fit_geometry
 from udccal.numerics import in_float64
 
 _UNSEEN_PX2 = 1e12
-# A coefficient that the data do not ask for is stated as 0, and named; centre and other coefficients take its part.
-_WORDS = {name: ("Held at 0",) for name in INTRINSIC_NAMES[2:]}
 
 
 def draw(seed: int) -> Case:
@@ -83,19 +80,18 @@ def answer(scene: Sight, seed: int, missing: float, far: float, swapped: int) ->
     return of_result(
         result,
         tuple(
-            Number(one.name, one.value - value, one.sigma, bound, _WORDS.get(one.name, ()))
+            Number(one.name, one.value - value, one.sigma, bound)
             for one, value, bound in zip(result.estimates, true, least, strict=True)
         ),
     )
 
 
 def _least(scene: Sight) -> np.ndarray:
-    """The bound with four coefficients of distortion and every corner in the picture; none for k3."""
-    camera = scene.camera
-    true = np.concatenate([camera.focal_px, camera.principal_point_px, camera.distortion[:4], scene.poses.ravel()])
+    """The bound with all coefficients of distortion and every corner in the picture."""
+    true = np.append(Intrinsics.of_geometry(scene.camera).vector, scene.poses.ravel())
     variance = np.repeat(np.where(scene.seen(), scene.sigma_px**2, _UNSEEN_PX2).ravel(), 2)
     information = fisher_information(corners_seen, true, board_points_mm(scene.spec), variance)
-    return np.append(cramer_rao(information, np.eye(len(true))[: LENS - 1]), math.nan)
+    return cramer_rao(information, np.eye(len(true))[:LENS])
 
 
 FAMILY = Family("geometry", draw, most_refused=0.1)
