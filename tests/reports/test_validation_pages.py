@@ -31,7 +31,7 @@ def validated(ok: bool) -> AnyPage:
         Check("psf", "NOT_CAPTURED", None, None, "", None, "The session has no captures of this term."),
     )
     stated = ("2026-01-01T00:00:00+00:00", "2026-01-02T00:00:00+00:00", "0" * 64)
-    found = Validation("f", 1, "toy", ok, "Do <this>.", *stated, ("wire",), checks, ValidationLimits())
+    found = Validation("f", 1, "toy", ok, "Do <this>.", *stated, ("wire",), ("psf",), checks, ValidationLimits())
     return validation_page(found, {"wire": ZMap(np.eye(5), "x", "y", "A map.")})
 
 
