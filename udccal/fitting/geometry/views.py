@@ -303,9 +303,10 @@ def _choose_order(
     if known[:4].max() > rules.prior_share:
         return Choice(tried[-1], tuple(tried)), None
     orders = choose(tried)
+    # Akaike's price of p1 and p2 is that of one, too: with that of both, a pair that is there has too little weight.
     return orders, orders.spread(
         samples,
         lambda of: np.append(of.place.intrinsics, of.place.poses),
-        against,
+        against + 2.0 * np.array([free[6] for free in ORDERS.values()]),
         lambda of: of.equations.joint_cov(),
     )
