@@ -200,13 +200,12 @@ class PylonCamera:
                     raise superseded()
                 if software:
                     trigger(device, timeout_s)
-                frame = self._frame(retrieve(device, timeout_s), settings, ticks_per_s)
-                yield replace(frame, temperature_C=temperature_C)
+                yield self._frame(retrieve(device, timeout_s), settings, ticks_per_s, temperature_C)
         finally:
             if self._stream == stream:  # otherwise it has ended, and another may run
                 stop(device)
 
-    def _frame(self, grabbed: Grabbed, asked: Settings, ticks_per_s: float) -> Frame:
+    def _frame(self, grabbed: Grabbed, asked: Settings, ticks_per_s: float, temperature_C: float | None) -> Frame:
         number, missed = self._ids.next(grabbed.block_id, grabbed.image_number)
         settings = replace(
             asked,
@@ -219,7 +218,7 @@ class PylonCamera:
         data = np.zeros((region.rows, region.columns), np.uint16) if grabbed.data is None else grabbed.data
         counts = self._counts
         self._counts = Counts(counts.delivered + 1, counts.incomplete + (not complete), counts.dropped + missed)
-        return Frame(data, settings, timestamp_s, number, complete)
+        return Frame(data, settings, timestamp_s, number, complete, temperature_C)
 
     def _prepare(self, device: OpenDevice) -> None:
         if self._feature_file is not None:

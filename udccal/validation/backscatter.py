@@ -18,7 +18,7 @@ from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Check, Judged, ZMap, at_most, chi2_check, unusable
 from udccal.validation.limits import ValidationLimits
-from udccal.validation.patterns import Samples, pattern_check
+from udccal.validation.patterns import Samples, bands, pattern_check
 
 # Every so many bins of the term's grid, down and across, are predicted.
 _EVERY = 4
@@ -188,5 +188,5 @@ def _parts(shape: tuple[int, int], most: int) -> tuple[Int[np.ndarray, " n"], in
     There are at most ``most`` parts a side, of two bins a side or more where the map has them.
     """
     down, across = (int(np.clip(size // 2, 1, most)) for size in shape)
-    y, x = (np.arange(size) * n // size for size, n in zip(shape, (down, across), strict=True))
+    y, x = bands(shape[0], down), bands(shape[1], across)
     return (y[:, None] * across + x).ravel(), down * across

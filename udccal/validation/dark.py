@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
-from udccal.fitting.engine.misfit import f_test
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.noise.moments import Moments, NoiseMoments
 from udccal.models.noise import Noise, linear_signal
 from udccal.validation.checks import Check
 from udccal.validation.limits import ValidationLimits
-from udccal.validation.patterns import Pattern, pattern_check, scatter_pattern
+from udccal.validation.patterns import Pattern, bands, pattern_check, scatter_pattern
 
 # Bands of rows and of columns, and parts of the sensor a side.
 _BANDS, _PARTS = 16, 8
@@ -48,11 +47,8 @@ def _bend(darks: tuple[Moments, ...], term: Noise) -> Pattern:
     inside = np.eye(len(times))[number] / sigma[:, None]
     line = np.column_stack([np.ones_like(exposure), exposure]) / sigma[:, None]
     off, within = (_left(columns, level / sigma) for columns in (line, inside))
-    rank, dof = len(times) - 2, len(level) - 2
-    bend, total = float(off @ off - within @ within), max(float(off @ off), 1e-300)
-    scale = float(within @ within) / max(dof - rank, 1)
-    test = f_test(bend * dof / total, rank, float(dof))
-    return Pattern(test, (bend - rank * scale) / max(float(np.sum(sigma**-2)), 1e-300))
+    total, weight = float(off @ off), float(np.sum(sigma**-2))
+    return Pattern.by_scatter(total - float(within @ within), total, len(times) - 2, len(level) - 2, weight)
 
 
 def _left(columns: Float[np.ndarray, "n k"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -94,15 +90,10 @@ def _patterns(dark_DN: Float32[np.ndarray, "rows columns"]) -> tuple[Pattern, ..
     about = np.where(bad, nearby, about).astype(np.float64)
     rows, columns = about.mean(axis=1), about.mean(axis=0)
     plain = about - rows[:, None] - columns + about.mean()
-    down, across = (_bands(size, _PARTS) for size in about.shape)
+    down, across = (bands(size, _PARTS) for size in about.shape)
     part = (down[:, None] * (across.max() + 1) + across).ravel()
-    bands = (scatter_pattern(line, _bands(len(line), _BANDS)) for line in (rows, columns))
-    return (*bands, scatter_pattern(plain.ravel(), part))
-
-
-def _bands(size: int, most: int) -> Int[np.ndarray, " n"]:
-    """Number of the band of each row or column."""
-    return np.arange(size) * min(most, size) // size
+    by_line = (scatter_pattern(line, bands(len(line), _BANDS)) for line in (rows, columns))
+    return (*by_line, scatter_pattern(plain.ravel(), part))
 
 
 def _dark_noise_DN(term: Noise) -> float:

@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Int
 
-from udccal.fitting.engine.misfit import MisfitTest, chi2_test, f_test, sharper
+from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, f_test, sharper
 from udccal.sessions.schema import TermName
 from udccal.validation.checks import Check, at_most
 
@@ -31,6 +31,19 @@ class Pattern:
 
     test: MisfitTest
     square: float
+
+    @classmethod
+    def by_scatter(cls, between: float, total: float, rank: int, dof: int, weight: float) -> Pattern:
+        """By an F-test, for errors whose noise is known from their scatter alone.
+
+        Args:
+            between: part of the sum of squares that the pattern explains, with ``rank`` degrees of freedom.
+            total: sum of squares, with ``dof`` degrees of freedom, those of ``rank`` included.
+            weight: sum of the weights of the squares: their number where all count alike.
+        """
+        within = max(total - between, 1e-300) / max(dof - rank, 1)
+        test = f_test(between * dof / max(total, 1e-300), rank, float(dof))
+        return cls(test, (between - rank * within) / max(weight, 1e-300))
 
 
 @final
@@ -78,10 +91,12 @@ def scatter_pattern(error: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"]
     about = error - error.mean()
     means = np.bincount(group, about)[seen] / count[seen]
     between, total = float(np.sum(count[seen] * means**2)), float(about @ about)
-    rank, dof = int(seen.sum()) - 1, len(error) - 1
-    within = max(total - between, 1e-300) / max(dof - rank, 1)
-    test = f_test(between * dof / max(total, 1e-300), rank, float(dof))
-    return Pattern(test, (between - rank * within) / len(error))
+    return Pattern.by_scatter(between, total, int(seen.sum()) - 1, len(error) - 1, float(len(error)))
+
+
+def bands(size: int, most: int) -> Int[np.ndarray, " size"]:
+    """Number of the band of each row or column, of ``most`` bands at most."""
+    return np.arange(size) * min(most, size) // size
 
 
 def pattern_check(
@@ -95,7 +110,7 @@ def pattern_check(
         data: what was predicted, for the sentence.
     """
     # As many tests as there are groupings find a pattern by chance as often as one test does.
-    tests = [sharper(one.test, *[MisfitTest(1.0, 1.0)] * (len(patterns) - 1)) for one in patterns]
+    tests = [sharper(one.test, *[NO_TEST] * (len(patterns) - 1)) for one in patterns]
     sizes = [max(one.square, 0.0) for one, test in zip(patterns, tests, strict=True) if test.found]
     value = scale * float(np.sqrt(max(sizes, default=0.0)))
     p_value = min(test.p_value for test in tests)

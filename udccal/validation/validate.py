@@ -90,7 +90,7 @@ def judge(
     sha256 = sha256_file(session.path / MANIFEST_NAME)
     same_session = sha256 == profile.provenance.session_sha256
     fitted = {term: fitted_steps(profile.result(term), session.steps(term), same_session) for term in ORDER}
-    own, partly = (tuple(t for t in ORDER if getattr(fitted[t], name)) for name in ("whole", "partly"))
+    own, partly = tuple(t for t in ORDER if fitted[t].whole), tuple(t for t in ORDER if fitted[t].partly)
 
     def one(term: TermName) -> Judged:
         progress(term)
@@ -134,7 +134,7 @@ def _judged(term: TermName, profile: Profile, session: Session, limits: Validati
         found = _predicted(term, profile, session, limits, fitted.count > 0)
     except MissingStepError as error:
         return _not_counted(term, "NOT_CAPTURED", f"The session has captures of a part of this term. {error}")
-    return replace(found, checks=(*found.checks, *_partly_own(term, fitted).checks)) if fitted.partly else found
+    return replace(found, checks=(*found.checks, _partly_own(term, fitted))) if fitted.partly else found
 
 
 def _predicted(term: TermName, profile: Profile, session: Session, limits: ValidationLimits, own: bool) -> Judged:
@@ -152,15 +152,19 @@ def _predicted(term: TermName, profile: Profile, session: Session, limits: Valid
 
 
 def _not_counted(term: TermName, name: str, what: str) -> Judged:
-    return Judged((Check(term, name, None, None, "", None, what),))
+    return Judged((_remark(term, name, what),))
 
 
-def _partly_own(term: TermName, fitted: Fitted) -> Judged:
+def _remark(term: TermName, name: str, what: str) -> Check:
+    return Check(term, name, None, None, "", None, what)
+
+
+def _partly_own(term: TermName, fitted: Fitted) -> Check:
     what = (
         f"The profile was fitted to {fitted.count} of the {fitted.steps} steps of this term in the session: these "
         "confirm little."
     )
-    return _not_counted(term, "captures of the profile's fit", what)
+    return _remark(term, "captures of the profile's fit", what)
 
 
 def _advice(

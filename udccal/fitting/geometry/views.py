@@ -289,8 +289,10 @@ def _choose_order(
     """
     points, solved, tried = full.points, full.solved, list[Attempt[Solved]]()
     samples, rounding = 2 * int(points.used.sum()), float(((1e-7 / points.sigma[points.used]) ** 2).sum())
-    # p1 and p2 come together.
-    against = 2 * np.log(rules.further_order) * np.array([sum(free[[4, 5, 6, 8]]) for free in ORDERS.values()])
+    # p1 and p2 come together, at the price of one.
+    pair = np.array(["p1 p2" in name for name in ORDERS])
+    coefficients = np.array([free.sum() for free in ORDERS.values()]) - ORDERS["no distortion"].sum()
+    against = 2 * np.log(rules.further_order) * (coefficients - pair)
     for price, (name, free) in reversed(list(zip(against, ORDERS.items(), strict=True))):
         if tried:
             above = Bundle(np.where(free, solved.place.intrinsics, 0.0), solved.place.poses)
@@ -307,6 +309,6 @@ def _choose_order(
     return orders, orders.spread(
         samples,
         lambda of: np.append(of.place.intrinsics, of.place.poses),
-        against + 2.0 * np.array([free[6] for free in ORDERS.values()]),
+        against + 2.0 * pair,
         lambda of: of.equations.joint_cov(),
     )

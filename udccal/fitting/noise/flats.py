@@ -85,8 +85,9 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
         return replace(empty, levels=levels, choice=choice)
 
     found = up_to(rules.fit_up_to)
-    parts = [part for part in (rules.narrow_up_to, 0.5 * rules.fit_up_to) if found.choice and found.fit.misfit.found]
-    for part in parts:
+    if not (found.choice and found.fit.misfit.found):
+        return found
+    for part in (rules.narrow_up_to, 0.5 * rules.fit_up_to):
         narrow = up_to(part)
         if narrow.usable_levels < rules.levels:
             break
