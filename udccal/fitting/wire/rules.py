@@ -8,9 +8,13 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.engine.least_squares import SolverRules
 from udccal.models.geometry import Geometry
 from udccal.models.wire import HIGHEST_ORDER, Wire
 from udccal.rig import RigDescription
+
+# Weakly determined parameters may creep on for ever: the descent ends at a tenth of a sigma, or when steps stall.
+SOLVER = SolverRules(least_gain=1e-2, stalled_gain=0.1)
 
 
 @final

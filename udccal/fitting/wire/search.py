@@ -16,14 +16,12 @@ from scipy.special import j1
 
 from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.orders import bic
+from udccal.fitting.wire.columns import shifted_columns
 from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, weighed
-from udccal.fitting.wire.jacobian import WireProblem, expected_of, rays_at, values_at, weighed_at, with_harmonics
+from udccal.fitting.wire.jacobian import WireProblem, rays_at, values_at, weighed_at, with_harmonics
 from udccal.fitting.wire.parameters import parameters_of, shape_sigma, shape_vector, with_shape
-from udccal.fitting.wire.rules import Harmonics, WireRules, WireStart, ideal_wire, possible_harmonics
+from udccal.fitting.wire.rules import SOLVER, Harmonics, WireRules, WireStart, ideal_wire, possible_harmonics
 from udccal.models.wire import Wire
-
-# Weakly determined parameters may creep on for ever: the descent ends at a tenth of a sigma, or when steps stall.
-SOLVER = SolverRules(least_gain=1e-2, stalled_gain=0.1)
 
 
 @final
@@ -113,7 +111,8 @@ class Search:
             tried += [(sharpness, one) for one in soft if one.criterion < sharp[0].criterion]
         finished = []
         for sharpness, one in tried:
-            wire = with_harmonics(_best_columns(one, weights, start.column_open), harmonics, few, sharpness)
+            shifted, chi2 = shifted_columns(one.wire, one.gains, weights, start.column_open)
+            wire = with_harmonics(shifted[int(np.argmin(chi2))], harmonics, few, sharpness)
             finished.append(Found(self._descent(wire, one.gains, weights), sample, gain, sharpness))
         return min(finished, key=lambda one: one.descent.criterion)
 
@@ -187,17 +186,6 @@ class Search:
         parameters = parameters_of(wire, self.rules, gains.size, panel=panel)
         problem = WireProblem(name, parameters, pixels, parameters.prior(self.data.start, self.rules))
         return Descent(problem, minimise(problem, parameters.vector(wire, gains), solver))
-
-
-def _best_columns(descent: Descent, pixels: Pixels, column_open: float) -> Wire:
-    """The best origin along X of eight in a period, with the columns' openings as built.
-
-    A fit to few pixels may put faint columns half a period off, with openings wider than their period.
-    """
-    wire = replace(descent.wire, column_open=np.float64(column_open))
-    shifted = [replace(wire, offset_periods=np.asarray(wire.offset_periods) + np.array([k / 8, 0.0])) for k in range(8)]
-    errors = (pixels.value - expected_of(one, descent.gains, pixels) for one in shifted)
-    return shifted[int(np.argmin([np.sum(error**2 * pixels.weight) for error in errors]))]
 
 
 def _rivals(tried: Sequence[Descent], margin: float) -> list[Descent]:
