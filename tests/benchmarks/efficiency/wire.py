@@ -44,7 +44,7 @@ from udccal.numerics import in_float64
 from udccal.result import FitResult
 from udccal.rig import load_rig
 
-_TRUTHS = 120
+_TRUTHS = 240
 # Of the largest rig's pixels, which a fit of the default effort uses.
 _CAMERA = load_rig("lg55-aca2040").camera
 SHARE = FitEffort().wire_samples / (_CAMERA.rows * _CAMERA.columns)
