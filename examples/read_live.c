@@ -15,7 +15,9 @@ struct header { /* constant but for the last two */
     uint64_t slot_bytes, first_slot, newest, closed;
 };
 
-static uint64_t word(const char *place) { return __atomic_load_n((const uint64_t *)place, __ATOMIC_ACQUIRE); }
+static uint64_t word(const void *place) { return __atomic_load_n((const uint64_t *)place, __ATOMIC_ACQUIRE); }
+
+static int failed(const char *why) { return fprintf(stderr, "%s\n", why), 1; }
 
 int main(int count, char **words) {
     char path[128];
@@ -26,28 +28,26 @@ int main(int count, char **words) {
     const char *memory = mmap(NULL, size.st_size, PROT_READ, MAP_SHARED, file, 0);
     const struct header *header = (const struct header *)memory;
     if (memory == MAP_FAILED || memcmp(header->magic, "UDCCALFR", 8) != 0 || header->version != 1)
-        return fprintf(stderr, "expected frames of udccal, version 1, found something else\n"), 1;
+        return failed("expected frames of udccal, version 1, found something else");
     size_t bytes = (size_t)header->stride * header->height;
     unsigned char *picture = malloc(bytes);
-    for (uint64_t seen = 0, waited = 0; !word((const char *)&header->closed);) {
-        uint64_t newest = word((const char *)&header->newest);
-        if (newest == seen) { /* the writer locks the memory for as long as it lives */
+    for (uint64_t seen = 0, newest; !word(&header->closed); seen = newest) {
+        if ((newest = word(&header->newest)) == seen) { /* the writer locks the memory for as long as it lives */
+            if (flock(file, LOCK_SH | LOCK_NB) == 0 && !word(&header->closed))
+                return failed("expected the writer to live, found that it was killed; start it again");
             usleep(1000);
-            if (++waited % 250 != 0 || flock(file, LOCK_SH | LOCK_NB) != 0 || word((const char *)&header->closed)) continue;
-            return fprintf(stderr, "expected the writer to live, found that it was killed; start it again\n"), 1;
+            continue;
         }
         const char *slot = memory + header->first_slot + (newest - 1) % header->slots * header->slot_bytes;
         uint64_t last = word(slot + header->slot_bytes - header->edge_bytes); /* first of all */
         memcpy(picture, slot + header->edge_bytes, bytes);
-        uint64_t frame_id = word(slot + 8);
+        uint64_t sum = 0, frame_id = word(slot + 8);
         __atomic_thread_fence(__ATOMIC_ACQUIRE);
         int whole = last == newest && word(slot) == newest; /* last of all */
-        uint64_t sum = 0;
         for (size_t i = 0; i < bytes; i++) sum += picture[i];
-        if (whole) printf("frame %llu: mean %.2f\n", (unsigned long long)frame_id, (double)sum / bytes);
-        else printf("frame %llu: torn\n", (unsigned long long)frame_id);
+        printf("frame %llu: ", (unsigned long long)frame_id);
+        whole ? printf("mean %.2f\n", (double)sum / bytes) : printf("torn\n");
         fflush(stdout);
-        seen = newest, waited = 0;
     }
     return 0;
 }

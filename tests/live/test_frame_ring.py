@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import struct
 import threading
@@ -45,13 +46,19 @@ def test_the_documentation_lists_the_header() -> None:
         assert name in text
 
 
+def _as_its_writer(path: Path) -> mmap.mmap:
+    """A file's memory, which keeps the file locked for as long as it is there."""
+    with path.open("r+b") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return mmap.mmap(file.fileno(), 0)
+
+
 @pytest.fixture
 def shared(tmp_path: Path) -> tuple[mmap.mmap, FrameRing, str]:
     """Memory in a file, its writer, and the name under which the example finds it."""
     path = tmp_path / "segment"
     path.write_bytes(bytes(LAYOUT.total_bytes))
-    with path.open("r+b") as file:
-        memory = mmap.mmap(file.fileno(), 0)
+    memory = _as_its_writer(path)
     return memory, FrameRing(memory, LAYOUT), str(path)
 
 
@@ -79,8 +86,7 @@ def test_frames_read_while_they_are_written_are_whole_or_known_to_be_torn(
     monkeypatch.setattr("udccal.live.sinks.frame_ring.SLOTS", 1)
     layout, path = Layout(300, 400), tmp_path / "segment"
     path.write_bytes(bytes(layout.total_bytes))
-    with path.open("r+b") as file:
-        ring = FrameRing(mmap.mmap(file.fileno(), 0), layout)
+    ring = FrameRing(_as_its_writer(path), layout)
     pictures = [restored_frame(number, 300, 400) for number in range(251)]
     ended = threading.Event()
 
