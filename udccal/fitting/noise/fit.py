@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from itertools import compress
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.engine.robust import outliers
 from udccal.fitting.noise.codes import start_values
 from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain
 from udccal.fitting.noise.moments import NoiseMoments, bins, reduced, stacked
+from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import Pattern, prnu, rough_median
 from udccal.models.noise import Noise, linear_signal
 from udccal.numerics import in_float64
-from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
+from udccal.result import Diagnostic, FitResult, FitStatus
 from udccal.rig import RigDescription
 
 # The last one, the fraction of the signal that is missing at full scale, is estimated where the data ask for it.
@@ -212,8 +211,8 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
             Diagnostic("dark_samples_outside_histogram", float(outside), "1"),
             Diagnostic("edge_gain", float(np.sqrt(np.mean(dark.fit.edge_gains**2))), "1"),
         ),
-        notes=tuple(_notes(data, dark, curve, uneven, values, bent_too_far)),
-        outliers=tuple(one for one in _outliers(data, dark, curve, float(values[2]), uneven) if one.count),
+        notes=tuple(notes(data, dark, curve, uneven, values, bent_too_far)),
+        outliers=tuple(one for one in left_out(data, dark, curve, uneven, float(values[2])) if one.count),
         residuals=residual_sample(places[np.nonzero(used)[1]], fit.variance_z[used]),
         posterior=Posterior.from_cov(values[:shown], cov[:shown, :shown], _term),
     )
@@ -247,94 +246,3 @@ def _values(
     jacobian[8, [0, 8]] = -spread / K**2, by_spread / K
     jacobian[10, [2, 4, 6]] = full_DN, -c, c
     return values, jacobian @ inner @ jacobian.T
-
-
-def _outliers(
-    data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation_DN: float, uneven: Pattern
-) -> Iterable[Outliers]:
-    rules, names = data.rules, [f"flat {i} ({flat.exposure_s:.4g} s)" for i, flat in enumerate(data.flats)]
-    names.append("flat stack")
-    # Unclipped samples stand out among clipped ones; that is no defect.
-    ceiling = saturation_DN - 0.1 * (curve.ceiling_DN - dark.black_DN)
-    seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
-    hits, sigma = sum(moments.outliers for moments in seen), f"{rules.outlier_sigma:g} robust sigma"
-    yield Outliers(f"two codes of a pixel {rules.hit_sigma:g} sigma apart in a pair (hits, blinking pixels)", hits)
-    yield from outliers(f"flats of a pair that differ in brightness by {sigma}", (names[i] for i in curve.flickering))
-    off_response = np.flatnonzero(np.isnan(curve.levels.light) & ~np.isnan(curve.inside.light))
-    yield from outliers(f"brightness off the response by {sigma}", (names[i] for i in off_response))
-    bins = int(np.sum(curve.inside.usable & ~curve.levels.usable))
-    yield Outliers(f"bins of flats off the photon transfer curve by {sigma}", bins)
-    for what, beside, found in (("dark", "(hot)", dark.offsets), ("flat", "their surroundings", uneven)):
-        places = tuple(f"row {row}, column {column}" for row, column in found.places)
-        rule = f"averaged {what} pixels {rules.defect_sigma:g} robust sigma off {beside}"
-        yield Outliers(rule, found.outliers, places)
-
-
-def _missing_codes(data: NoiseMoments) -> Int[np.ndarray, " missing"]:
-    """Codes that no flat has although it has many samples of codes on both sides, and noise of some codes."""
-    near, missing = 8, np.zeros(0, int)
-    for flat in data.flats:
-        if float(flat.variance_DN2.min()) > (0.5 * near * data.q_DN) ** 2:
-            codes = np.pad(flat.codes[:: data.q_DN], near)
-            most = np.lib.stride_tricks.sliding_window_view(codes, near).max(axis=1)
-            beside = np.minimum(most[: -near - 1], most[near + 1 :])
-            missing = np.union1d(missing, np.flatnonzero((codes[near:-near] == 0) & (beside >= 100)) * data.q_DN)
-    return missing
-
-
-def _notes(
-    data: NoiseMoments,
-    dark: DarkTerms,
-    curve: Curve,
-    uneven: Pattern,
-    values: Float[np.ndarray, "11"],
-    bent_too_far: bool,
-) -> Iterable[str]:
-    if not (curve.full.any() or curve.pile):
-        yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
-    if not dark.white:
-        yield (
-            "Rounding or cut-off codes bend the dark codes: black, dark noise, row noise, dark current and DSNU come "
-            "from histograms, and hold for read noise of the model's kind (Tukey's lambda)."
-        )
-    if len({pair.exposure_s for pair in data.darks}) < 2:
-        yield "Dark frames of one exposure time do not tell dark current from black: black holds both."
-    if uneven.structure2 > 0:
-        found = f"Flats vary by {100 * uneven.structure2**0.5:.2g} % between pixels, but not as white noise does."
-        yield f"{found} That counts as light, as a panel's; columns or blotches of the sensor are not in PRNU1288."
-    if dark.foreign:
-        yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
-    if dark.skewed:
-        yield (
-            "Read noise or dark current has one tail, which the model's has not: black and dark current are those of "
-            "the mean code of all pixels."
-        )
-    if dark.unsteady_DN:
-        found = f"The mean of dark frames is off black and dark current by {dark.unsteady_DN:.2g} DN"
-        yield f"{found} from exposure to exposure; the sigmas of black, dark current and saturation include that."
-    size = data.flat_stack.mean_DN.size
-    hot = max(1 - data.dark_samples / (len(data.darks) * size), dark.offsets.outliers / size)
-    if hot > data.rules.most_hot:
-        without = "DSNU is that" if dark.skewed else "black, dark current and DSNU are those"
-        yield f"{100 * hot:.2g} % of dark samples are far from the others (hot pixels): {without} of the others."
-        if not dark.white:
-            yield "PRNU1288 is what is left without that DSNU: offsets of hot pixels, which rounding hides, are in it."
-    if len(missing := _missing_codes(data)):
-        yield (
-            f"{len(missing)} codes between others never occur (the first is {missing[0]}): the converter's steps are "
-            "uneven, and noise of a few codes, black and saturation are those of its codes."
-        )
-    if (test := curve.fit.misfit).found:
-        found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
-        yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
-        yield "PRNU1288 holds for the photon transfer curve as fitted, which the variances do not follow."
-    if curve.fit.order.curved:
-        yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."
-    if bent_too_far:
-        yield "The response bends more than the model can describe. Check the exposures and the lamp."
-    if curve.fit_up_to < 0.9:
-        yield f"Flats above {100 * curve.fit_up_to:.0f} % of saturation do not follow the curve and are left out."
-        if rough_median(data.flat_stack.mean_DN) - dark.black_DN > curve.fit_up_to * (curve.ceiling_DN - dark.black_DN):
-            yield "The flat stack is brighter than that: PRNU1288 holds for a curve that goes on."
-    if curve.fit.order.unsteady:
-        yield f"The light differs by {100 * curve.fit.scatter:.2g} % from level to level."
