@@ -1,4 +1,4 @@
-"""The footprint's place on the rows, in which the data are periodic."""
+"""The pupil's footprint: its place on the rows, in which the data are periodic, and its width."""
 
 from __future__ import annotations
 
@@ -6,27 +6,55 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from jaxtyping import Float
 
-from tests.scenes.psf import pictures, shots_of, small_scene
+from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.effort import FitEffort
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import fit_diffraction
 from udccal.fitting.psf.kernel import start_model, start_prior
+from udccal.fitting.psf.samples import some_shots
 from udccal.numerics import in_float64
+
+
+def _drawn(scene: Scene, prior: Prior, seed: int) -> tuple[Float[np.ndarray, " p"], Shots]:
+    """Parameters drawn from the prior, and what the fit works on."""
+    rng = np.random.default_rng(seed)
+    cov = np.linalg.inv(prior.precision)
+    true = prior.mean + np.linalg.cholesky(cov) @ rng.standard_normal(len(cov))
+    return true, shots_of(scene, pictures(scene, true, rng), rng)
 
 
 @pytest.mark.medium
 @in_float64
 def test_a_descent_that_leaves_the_footprint_for_another_period_begins_there_again() -> None:
     """Of this specimen, the first descent ended 12 sigma of the prior away: openings were 38 of their sigmas off."""
-    scene, rng = small_scene(positions=(3, 1), shifts=8, half=(14, 7)), np.random.default_rng(80)
+    scene = small_scene(positions=(3, 1), shifts=8, half=(14, 7))
     start = start_model(scene.rig, scene.geometry, scene.wire)
     prior = start_prior(scene.rig, start)
-    cov = np.linalg.inv(prior.precision)
-    true = prior.mean + np.linalg.cholesky(cov) @ rng.standard_normal(len(cov))
-    shots = shots_of(scene, pictures(scene, true, rng), rng)
+    true, shots = _drawn(scene, prior, 80)
     every_other = np.arange(len(shots.position)) % 2 == 0
     rules = replace(FitEffort().psf, close_px=scene.half, iterations=60)
     fit = fit_diffraction(shots.pick(every_other), scene.geometry, start, prior, rules)
     assert fit.converged
     z = (fit.theta - true) / np.sqrt(np.diag(fit.noise_cov))
+    assert np.abs(z[:13]).max() < 4.5
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("wider", "seed"), [(1.2, 1), (1.5, 2)])
+@in_float64
+def test_a_footprint_that_starts_too_wide_does_not_end_beside_the_minimum(wider: float, seed: int) -> None:
+    """A descent ended where a model error of a hundredth let a pupil 11 and 13 of its sigmas too wide fit."""
+    scene = small_scene(positions=(3, 2), shifts=2, half=(14, 7))
+    true, shots = _drawn(scene, start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire)), seed)
+    wire = replace(scene.wire, footprint_per_pitch=scene.wire.footprint_per_pitch * wider)
+    start = start_model(scene.rig, scene.geometry, wire)
+    rules = PsfRules(positions=8, close_px=scene.half, far_fraction=1.0, iterations=60)
+    some = shots.pick(some_shots(shots, rules))
+    fit = fit_diffraction(some, scene.geometry, start, start_prior(scene.rig, start), rules)
+    assert fit.converged
+    assert fit.model_error == 0.0
+    z = (fit.theta - true) / np.sqrt(np.diag(fit.cov()))
     assert np.abs(z[:13]).max() < 4.5

@@ -18,7 +18,7 @@ from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
-from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
+from udccal.fitting.psf.kernel import FOOTPRINT, PUPIL, Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of
 from udccal.fitting.psf.samples import (
     Lights,
@@ -123,51 +123,67 @@ def fit_diffraction(
     ``start`` gives the nodes of the spectra. With a ``visibility``, the footprint's place on the rows is known, and
     ``phase`` says whether the data show it. The mean of the ``prior`` is the start.
     """
-    chosen = choose_samples(shots, rules)
     evaluator = Evaluator(
         np.asarray(start.wavelengths_nm), fit_lattice(rules.close(shots.half)), bool(start.visibility)
     )
-    problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
-    near = _approach(problem, rules)
-    own, index, places = near.place.own.copy(), problem.samples.index, shots.centre_px.copy()
-    places[index[index >= 0]] += own[index >= 0][:, :2]
-    own[..., :2] = 0.0
-    shots = replace(shots, centre_px=places)
-    problem = replace(problem, samples=gather(shots, geometry, chosen))
-    fit = _refine(problem, shots, near.place.theta, own, rules, near.iterations)
+    problem = DiffractionProblem(gather(shots, geometry, choose_samples(shots, rules)), evaluator, prior)
+    problem = problem.with_overlaps(prior.mean)
+    fits = [_settled(problem, near, shots, geometry, rules) for near in _approach(problem, rules)]
+    fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits))
     if not evaluator.interference:
         return fit
     phase = phase_evidence(fit)
     if phase.best is not phase.tried[0]:
         alone = Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False)
-        averaged = DiffractionProblem(problem.samples, alone, prior)
-        fit = _refine(averaged, shots, fit.theta, fit.solution.place.own, rules, 0)
+        averaged = DiffractionProblem(fit.problem.samples, alone, prior)
+        fit = _refine(averaged, fit.shots, fit.theta, fit.solution.place.own, rules, 0)
     return replace(fit, phase=phase)
 
 
-def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
+def _approach(problem: DiffractionProblem, rules: PsfRules) -> tuple[Solution[Place, Blocks], ...]:
     """Go from the prior's mean until a step gains a thousandth of the cost; weights are by the data.
 
-    The footprint's place on the rows is periodic in the data. A descent may therefore end beside the lowest minimum,
-    with a footprint far from the prior: it begins again with the prior's, and the lower minimum counts.
+    A start that is off may end beside the lowest minimum. The footprint's place on the rows is periodic in the data,
+    and takes the part of a pupil that is too wide; a model error as large as the residuals there lets the place fit. A
+    descent that leaves the prior for this therefore begins again, with the footprint's place held, which leaves the
+    residuals to the pupil, and without a model error. Both ends are returned: their minima tell which is the lower.
     """
-    prior, problem = problem.prior, replace(problem, samples=weighed(problem.samples, rules.first_model_error))
+    prior = problem.prior
 
-    def from_(theta: Theta) -> Solution[Place, Blocks]:
+    def from_mean(problem: DiffractionProblem) -> Solution[Place, Blocks]:
         def start(one: Samples) -> Own:
-            return start_own(problem.evaluator, one, kernel_of(problem.evaluator, theta, one))
+            return start_own(problem.evaluator, one, kernel_of(problem.evaluator, prior.mean, one))
 
         own = np.stack(in_two_threads(start, problem.samples.each()))
-        return minimise(problem, problem.at(theta, own), _solver(1e-3 * problem.used, rules.iterations))
+        return minimise(problem, problem.at(prior.mean, own), _solver(1e-3 * problem.used, rules.iterations))
 
-    first = from_(prior.mean)
-    found = first.place.theta.copy()
-    if (np.abs(found - prior.mean) <= _FAR_SIGMA * prior.sigma)[FOOTPRINT].all():
-        return first
-    found[FOOTPRINT] = prior.mean[FOOTPRINT]
-    second = from_(found)
-    lower = min(first, second, key=lambda one: one.equations.cost)
-    return replace(lower, iterations=first.iterations + second.iterations)
+    first = from_mean(replace(problem, samples=weighed(problem.samples, rules.first_model_error)))
+    far = np.abs(first.place.theta - prior.mean) > _FAR_SIGMA * prior.sigma
+    if not far[PUPIL] and not far[FOOTPRINT].any():
+        return (first,)
+    held = np.zeros(prior.mean.size, dtype=bool)
+    held[FOOTPRINT] = True
+    return first, from_mean(replace(problem, samples=weighed(problem.samples, 0.0), held=held))
+
+
+def _settled(
+    problem: DiffractionProblem, near: Solution[Place, Blocks], shots: Shots, geometry: Geometry, rules: PsfRules
+) -> DiffractionFit:
+    """Go from a first descent's end to the minimum, with the samples about the places of LEDs found there."""
+    own, index, places = near.place.own.copy(), problem.samples.index, shots.centre_px.copy()
+    places[index[index >= 0]] += own[index >= 0][:, :2]
+    own[..., :2] = 0.0
+    moved = replace(shots, centre_px=places)
+    problem = replace(problem, samples=gather(moved, geometry, choose_samples(shots, rules)))
+    return _refine(problem, moved, near.place.theta, own, rules, near.iterations)
+
+
+def _unlikely(fit: DiffractionFit) -> float:
+    """Return minus twice the logarithm of the likelihood of all samples, outliers too, and of the prior."""
+    place = fit.solution.place
+    samples = weighed(fit.problem.samples, fit.model_error, place.light, place.own[..., 5:])
+    variances = float(-np.log(samples.weight[samples.weight > 0]).sum())
+    return replace(fit.problem, samples=samples).equations_at(place).cost + variances
 
 
 def _refine(

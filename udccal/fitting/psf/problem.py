@@ -10,7 +10,7 @@ from typing import Final, final
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.special import softmax
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
@@ -76,12 +76,14 @@ class DiffractionProblem:
     """Diffraction for the engine's solver; the groups of its equations are the shots, position after position.
 
     Interference depends on the place of the pupil's footprint and on its overlaps, which take long to compute. It is
-    therefore set up about one place, with its changes around that place to first order.
+    therefore set up about one place, with its changes around that place to first order. Shared parameters that are
+    ``held`` make no step.
     """
 
     samples: Samples
     evaluator: Evaluator
     prior: Prior
+    held: Bool[np.ndarray, " p"] | None = None
     name: str = "psf"
 
     @property
@@ -128,7 +130,7 @@ class DiffractionProblem:
         """
         data = Blocks.joined(self.by_position(place))
         data.shared[BLUR, BLUR] += max(-2.0 * data.right[BLUR], 0.0)
-        return data.with_prior(self.prior, place.theta)
+        return replace(data, held=self.held).with_prior(self.prior, place.theta)
 
     def moved(self, place: Place, step: Step) -> Place:
         """Return the place after a step."""
