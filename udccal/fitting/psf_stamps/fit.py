@@ -236,10 +236,10 @@ def _report(
     chi2_dof = float(z @ z) / max(z.size - effective, 1.0)
     inflation = float(np.sqrt(chi2_dof)) if chi2_dof > rules.inflate_above else 1.0
     draws = draws * inflation + drawn(state, *draws.shape)
-    # The way that is left is one more standard deviation, and so is the way back to what the data alone prefer: kernels
-    # with more structure than the priors expect are smoothed by about as much.
-    for seed_of, way in ((2, posterior.mode), (3, posterior.solved(state.prior @ state.vector))):
-        draws += way[:, None] * np.random.default_rng(seed_of).standard_normal(rules.draws[1])
+    # The way that is left, and on to what the data alone prefer, is one more standard deviation: kernels with more
+    # structure than the priors expect are smoothed by about as much.
+    way = posterior.mode + posterior.solved(state.prior @ state.vector)
+    draws += way[:, None] * np.random.default_rng(3).standard_normal(rules.draws[1])
     term = _term(stamps, state, draws / np.sqrt(rules.draws[1]))
     # The expected error, then the maps' coefficients, named by colour, element and degrees in x and y.
     size, spread = np.sqrt((term.relative_l2(term.star_px, term.field.reference) ** 2).mean(axis=0))

@@ -8,6 +8,7 @@ which shows smaller errors. The larger one counts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -33,10 +34,10 @@ def without_error(state: State) -> State:
 
 
 def of_residuals(stamps: Stamps, state: State) -> Nodes:
-    """Return the model error that a fit's own residuals show, in most stars: hits have little weight."""
+    """Return the model error that a fit's own residuals show in most stars."""
     seen = expectation(stamps, without_error(state))
     variance = np.divide(1.0, seen.weight, out=np.zeros_like(seen.weight), where=seen.weight > 0)
-    return _shown(stamps, state, seen.residual**2, variance, chance=1.0)
+    return _shown(stamps, state, seen.residual**2, variance, 1.0, _typical)
 
 
 def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> Nodes:
@@ -62,7 +63,7 @@ def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> Nodes
         every = 1.0 - (taken**2).sum(axis=2) + (change**2).mean(axis=2)
         square[out] = (seen.residual**2)[out]
         np.divide(every, seen.weight, out=variance, where=(seen.weight > 0) & out[:, None])
-    return _shown(stamps, state, square, variance, chance=SIGNIFICANT)
+    return _shown(stamps, state, square, variance, SIGNIFICANT, _larger)
 
 
 def placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> State:
@@ -96,10 +97,11 @@ def _shown(
     square: Float[np.ndarray, "stars samples"],
     variance: Float[np.ndarray, "stars samples"],
     chance: float,
+    excess_of: Callable[[np.ndarray, np.ndarray], float],
 ) -> Nodes:
-    """Return the model error that squares of residuals show in most samples, by medians, where chance is less likely.
+    """Return the model error by which squares of residuals exceed their variances, where chance is less likely.
 
-    Samples of zero variance are not used. Stars at the edge, for which the others extrapolate, have little weight.
+    Samples of zero variance are not used.
     """
     used = (variance > 0) & ~stamps.clipped
     node = expectation(stamps, state).node[used]
@@ -110,11 +112,25 @@ def _shown(
         own = groups.ravel()[node]
         order = np.argsort(own, kind="stable")
         for index in np.split(order, np.flatnonzero(np.diff(own[order])) + 1):
-            excess = MAD_TO_SIGMA**2 * np.median(square[index] / unit[index]) - np.median(variance[index] / unit[index])
+            excess = excess_of(square[index] / unit[index], variance[index] / unit[index])
             if excess > 0 and chi2_tail(float((square[index] / variance[index]).sum()), index.size) <= chance:
                 here = groups.ravel() == own[index[0]]
                 found[here] = np.maximum(found[here], np.sqrt(excess))
     return state.size * found.reshape(state.size.shape)
+
+
+def _typical(square: np.ndarray, variance: np.ndarray) -> float:
+    """Return the excess of most squares over their variances, by medians: hits have little weight."""
+    return float(MAD_TO_SIGMA**2 * np.median(square) - np.median(variance))
+
+
+def _larger(square: np.ndarray, variance: np.ndarray) -> float:
+    """Return the excess of most squares, or of all of them if that is larger: an error may be that of a few stars.
+
+    The mean over all is a step of maximum likelihood from no excess: stars at the edge, for which the others
+    extrapolate, have little weight.
+    """
+    return max(_typical(square, variance), float(np.average(square - variance, weights=variance**-2.0)))
 
 
 def _groups(state: State) -> tuple[Int[np.ndarray, "planes grid_rows grid_columns"], ...]:
@@ -126,6 +142,28 @@ def _groups(state: State) -> tuple[Int[np.ndarray, "planes grid_rows grid_column
     return plane + 1000 * (y[:, None] - y[0]) + (x - x[0]), plane + light.astype(int)
 
 
+def resized(stamps: Stamps, state: State, rules: StampsRules) -> State:
+    """Return the state with a larger size E where nodes of similar light have larger squares than the prior expects.
+
+    One smoothness serves all light: darkness is smoother, and faint rings and orders of diffraction are as sharp as the
+    core, so that error bars of these would be too small.
+    """
+    (root, counts), draws = state.roots, laplace(stamps, state).draws(np.random.default_rng(0), rules.draws[0])
+    ends = np.cumsum(counts)[: state.of_images.size].reshape(state.of_images.shape)[:, 0, 1]
+    precision, size = np.repeat(state.precisions, counts), state.size.copy()
+    # Of each node, the squares that are there, and the part of them that the data leave open: 1 is expected together.
+    squares = [precision * ((root @ each) ** 2).mean(axis=1) for each in (state.vector[:, None], draws)]
+    by_light = _groups(state)[1]
+    for plane, end in enumerate(ends):
+        nodes = size[plane].size
+        there, left = (part[end - 2 * nodes : end].reshape(2, nodes).sum(axis=0) for part in squares)
+        group = by_light[plane].ravel() - by_light[plane].min()
+        known = np.maximum(np.bincount(group, 1.0 - left), 0.0)
+        ratio = np.maximum((1.0 + np.bincount(group, there)) / (1.0 + known), 1.0)
+        size[plane] *= np.sqrt(ratio[group]).reshape(size[plane].shape)
+    return replace(state, size=size)
+
+
 def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknowns k"]:
     """Draw what the model does not describe, as noise of the first images' nodes that gives kernels its model error."""
     out = np.zeros((unknowns, count))
@@ -133,10 +171,14 @@ def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknown
     # The mean sum of squared weights of a cubic B-spline is 0.479 along an axis.
     rng = np.random.default_rng(1)
     nodes[:, 0] += state.model_error[..., None] / 0.479 * rng.standard_normal((*state.size.shape, count))
-    # Where further images have no nodes, they may be as large as their prior, which the others set.
+    # Where further images have no nodes, they may be as large as their prior, which the others set, or change in step
+    # with the light where they have nodes: a star's light and the field's are told apart by neither.
     eigenvalues, left = laplacian(*state.size.shape[1:])[1], ~np.moveaxis(state.kept, 2, 0)
+    first, total = state.field.nodes[:, 0], np.asarray(state.field.nodes).sum(axis=(2, 3))
     for image in np.flatnonzero(left.any(axis=(1, 2))):
         a, b = state.of_images[:, image].T[..., None]
         spread = np.sqrt((1.0 / (a + b * eigenvalues)).mean(axis=1))[:, None, None] * state.size * left[image]
         nodes[:, image] += spread[..., None] / 0.479 * rng.standard_normal((*spread.shape, count))
+        in_step = (total[:, image] / total[:, 0])[:, None, None] * first * left[image]
+        nodes[:, image] += in_step[..., None] * rng.standard_normal(count)
     return out

@@ -45,9 +45,11 @@ def envelope(
     return np.sqrt(scipy.ndimage.gaussian_filter(nodes**2, width, mode="nearest") + least)
 
 
-def faintest(stamps: Stamps, light_e: Float[np.ndarray, "stars planes"]) -> Float[np.ndarray, " planes"]:
-    """Return the noise without light of a sample in all stars together, relative to their light."""
-    return stamps.read_e / np.linalg.norm(light_e, axis=0)
+def faintest(
+    stamps: Stamps, light_e: Float[np.ndarray, "stars planes"], background_e: Float[np.ndarray, "stars planes"]
+) -> Float[np.ndarray, " planes"]:
+    """Return the noise of a sample without a star's light in all stars together, relative to their light."""
+    return 1.0 / np.linalg.norm(light_e / np.sqrt(stamps.read_e**2 + np.maximum(background_e, 0.0)), axis=0)
 
 
 def grid_size(shape: tuple[int, ...], spacing_px: float, reach: float) -> tuple[int, int]:
@@ -203,7 +205,7 @@ class State:
         precisions = self.precisions.copy()
         precisions[: self.of_images.size] *= np.tile([ratio**2, ratio**-2], self.of_images.size // 2)
         field = replace(self.field, nodes=nodes, spacing_px=spacing_px)
-        size = envelope(nodes[:, 0], spacing_px, faintest(stamps, self.light_e))
+        size = envelope(nodes[:, 0], spacing_px, faintest(stamps, self.light_e, self.background_e))
         state = replace(self, field=field, precisions=precisions, size=size, model_error=np.zeros_like(size))
         return state._confined(rules)
 

@@ -19,7 +19,7 @@ from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, backgrounds, centroids, edge_light, light_of
 from udccal.fitting.psf_stamps.equations import Laplace, laplace
 from udccal.fitting.psf_stamps.field import PsfField, polynomials, taps
-from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, without_error
+from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, resized, without_error
 from udccal.fitting.psf_stamps.probability import (
     ABSENT,
     HELD,
@@ -158,7 +158,7 @@ def start(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
     pedestal = (stamps.values_e[0].size / rules.most_pedestal) ** 2
     precisions = np.concatenate([images, maps, lateral, [pedestal], 1.0 / expected])
     centre_px, light_e = centroids(stamps, background_e, WINDOW_PX), light_of(stamps, background_e)
-    size = envelope(nodes[:, 0], spacing_px, faintest(stamps, light_e))
+    size = envelope(nodes[:, 0], spacing_px, faintest(stamps, light_e, background_e))
     keep = np.ones_like(stamps.known)
     return State(field, centre_px, light_e, background_e, precisions, size, keep, np.zeros_like(size))
 
@@ -191,7 +191,8 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
     state = best.fit.place if orders else _denser(stamps, best.fit.place, rules)
     state = without_outliers(stamps, state, rules)
     state = replace(state, model_error=of_stars_left_out(stamps, state, rules))
-    final = replace(best, fit=improve(stamps, state, rules, rules.steps_to_end))
+    found = improve(stamps, state, rules, rules.steps_to_end)
+    final = replace(best, fit=replace(found, place=resized(stamps, found.place, rules)))
     return Choice(final, (*(t for t in tried if t is not best), final))
 
 
