@@ -1,0 +1,52 @@
+"""What error bars of a psf from stamps hold beside noise: errors of a few stars, light beyond the reach of images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.fitting.psf_stamps.test_psf_stamps import READ_E, make
+from udccal.fitting.psf_stamps.data import StampsRules
+from udccal.fitting.psf_stamps.field import Changes
+from udccal.fitting.psf_stamps.model_error import _larger, drawn
+from udccal.fitting.psf_stamps.probability import faintest
+from udccal.fitting.psf_stamps.search import start
+from udccal.numerics import in_float64
+
+
+def test_the_noise_of_all_stars_together_is_also_that_of_the_background() -> None:
+    stamps, light_e = make(1, count=25)[0], np.full((25, 1), 1e4)
+    for level_e, noise_e in ((0.0, READ_E), (-20.0, READ_E), (100.0 - READ_E**2, 10.0)):
+        found = faintest(stamps, light_e, np.full((25, 1), level_e))
+        assert found == pytest.approx(noise_e / 5e4)
+
+
+def test_an_error_of_a_few_stars_counts() -> None:
+    rng = np.random.default_rng(3)
+    variance = np.repeat([1.0, 25.0], 5000)
+    noise = np.sqrt(variance) * rng.standard_normal(10000)
+    few, every = np.where(np.arange(10000) % 10, 0.0, 3.0), np.full(10000, 0.9)
+    assert abs(_larger(noise**2, variance)) < 0.1
+    for error in (few, every):
+        found = _larger((noise + error) ** 2, variance)
+        assert found == pytest.approx((error**2).mean(), rel=0.25)
+
+
+@in_float64
+def test_light_beyond_the_reach_of_an_image_may_follow_that_within() -> None:
+    stamps, rules = make(1)[0], StampsRules(most_work=1e5)
+    state = start(stamps, rules, 1).with_images(np.eye(3)[:2], rules)
+    assert state.margin > 3
+    nodes = state.field.nodes.copy()
+    nodes[:, 1] = 0.2 * nodes[:, 0].sum() / state.kept[..., 1].sum() * state.kept[..., 1]
+    # Of precisions so large, nothing but the step that both share is left.
+    of_images = np.full(state.of_images.shape, 1e12).ravel()
+    precisions = np.concatenate([of_images, state.precisions[of_images.size :]])
+    state = replace(state, field=replace(state.field, nodes=nodes), precisions=precisions)
+    changes = Changes.of(state.field, len(stamps.unit), drawn(state, state.vector.size, 2000))
+    relative = changes.nodes[0, 1] / nodes[0, 0, ..., None]
+    beyond = ~state.kept[..., 1]
+    np.testing.assert_allclose(relative[beyond].std(axis=1), 0.2, rtol=0.1)
+    np.testing.assert_array_equal(relative[~beyond], 0.0)
