@@ -135,7 +135,9 @@ def fit_diffraction(
     phase = phase_evidence(fit)
     if phase.best is not phase.tried[0]:
         alone = Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False)
-        averaged = DiffractionProblem(fit.problem.samples, alone, prior)
+        # Those of the fit hold corrections of interference.
+        samples = gather(fit.shots, geometry, choose_samples(shots, rules))
+        averaged = DiffractionProblem(samples, alone, prior)
         fit = _refine(averaged, fit.shots, fit.theta, fit.solution.place.own, rules, 0)
     return replace(fit, phase=phase)
 
