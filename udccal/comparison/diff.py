@@ -114,8 +114,8 @@ def diff(a: Profile, b: Profile, limits: DiffLimits | None = None) -> ProfileDif
         limits: thresholds of the verdicts; None for those of docs/diff.md.
 
     Returns:
-        a verdict per term and of the whole, with the numbers behind it. The first comparison compiles for half a
-        minute.
+        a verdict per term and of the whole, with the numbers behind it. The first comparison compiles for some
+        seconds.
 
     Raises:
         ProfileError: when they are of different rigs or cameras, hold a covariance that cannot be one, or terms that
