@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.special import ndtr
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse, square_root
@@ -123,12 +123,12 @@ def fit_diffraction(
     ``start`` gives the nodes of the spectra. With a ``visibility``, the footprint's place on the rows is known, and
     ``phase`` says whether the data show it. The mean of the ``prior`` is the start.
     """
+    chosen = choose_samples(shots, rules)
     evaluator = Evaluator(
         np.asarray(start.wavelengths_nm), fit_lattice(rules.close(shots.half)), bool(start.visibility)
     )
-    problem = DiffractionProblem(gather(shots, geometry, choose_samples(shots, rules)), evaluator, prior)
-    problem = problem.with_overlaps(prior.mean)
-    fits = [_settled(problem, near, shots, geometry, rules) for near in _approach(problem, rules)]
+    problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
+    fits = [_settled(problem, near, shots, geometry, chosen, rules) for near in _approach(problem, rules)]
     fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits))
     if not evaluator.interference:
         return fit
@@ -136,8 +136,7 @@ def fit_diffraction(
     if phase.best is not phase.tried[0]:
         alone = Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False)
         # Those of the fit hold corrections of interference.
-        samples = gather(fit.shots, geometry, choose_samples(shots, rules))
-        averaged = DiffractionProblem(samples, alone, prior)
+        averaged = DiffractionProblem(gather(fit.shots, geometry, chosen), alone, prior)
         fit = _refine(averaged, fit.shots, fit.theta, fit.solution.place.own, rules, 0)
     return replace(fit, phase=phase)
 
@@ -169,14 +168,19 @@ def _approach(problem: DiffractionProblem, rules: PsfRules) -> tuple[Solution[Pl
 
 
 def _settled(
-    problem: DiffractionProblem, near: Solution[Place, Blocks], shots: Shots, geometry: Geometry, rules: PsfRules
+    problem: DiffractionProblem,
+    near: Solution[Place, Blocks],
+    shots: Shots,
+    geometry: Geometry,
+    chosen: Bool[np.ndarray, "shots rows columns"],
+    rules: PsfRules,
 ) -> DiffractionFit:
     """Go from a first descent's end to the minimum, with the samples about the places of LEDs found there."""
     own, index, places = near.place.own.copy(), problem.samples.index, shots.centre_px.copy()
     places[index[index >= 0]] += own[index >= 0][:, :2]
     own[..., :2] = 0.0
     moved = replace(shots, centre_px=places)
-    problem = replace(problem, samples=gather(moved, geometry, choose_samples(shots, rules)))
+    problem = replace(problem, samples=gather(moved, geometry, chosen))
     return _refine(problem, moved, near.place.theta, own, rules, near.iterations)
 
 

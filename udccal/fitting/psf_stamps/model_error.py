@@ -26,6 +26,7 @@ _NEAR_PX = 2.0  # size of the squares whose nodes are near each other
 _FACTOR = 4.0  # within which nodes are of similar light
 
 Nodes = Float[np.ndarray, "planes grid_rows grid_columns"]
+Some = Float[np.ndarray, " some"]
 
 
 def without_error(state: State) -> State:
@@ -97,7 +98,7 @@ def _shown(
     square: Float[np.ndarray, "stars samples"],
     variance: Float[np.ndarray, "stars samples"],
     chance: float,
-    excess_of: Callable[[np.ndarray, np.ndarray], float],
+    excess_of: Callable[[Some, Some], float],
 ) -> Nodes:
     """Return the model error by which squares of residuals exceed their variances, where chance is less likely.
 
@@ -119,12 +120,12 @@ def _shown(
     return state.size * found.reshape(state.size.shape)
 
 
-def _typical(square: np.ndarray, variance: np.ndarray) -> float:
+def _typical(square: Some, variance: Some) -> float:
     """Return the excess of most squares over their variances, by medians: hits have little weight."""
     return float(MAD_TO_SIGMA**2 * np.median(square) - np.median(variance))
 
 
-def _larger(square: np.ndarray, variance: np.ndarray) -> float:
+def _larger(square: Some, variance: Some) -> float:
     """Return the excess of most squares, or of all of them if that is larger: an error may be that of a few stars.
 
     The mean over all is a step of maximum likelihood from no excess: stars at the edge, for which the others

@@ -21,18 +21,19 @@ _APART = 1 / 32
 Found = Solution[Float[np.ndarray, " n"], Blocks]
 
 
-def shifted_columns(
-    wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels, column_open: float
-) -> tuple[list[Wire], Float[np.ndarray, "8"]]:
-    """The wire with its origin along X moved by each eighth of a period, and chi-squared of the pixels with each.
+def likely_columns(
+    wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels, column_open: float, margin: float = 0.0
+) -> list[Wire]:
+    """The wire with its origin along X moved by each eighth of a period, where that fits the pixels; the best is first.
 
-    The columns' openings are as built: a fit to few pixels may put faint columns half a period off, with openings wider
-    than their period.
+    Chi-squared is at most ``margin`` above the lowest. The columns' openings are as built: a fit to few pixels may put
+    faint columns half a period off, with openings wider than their period.
     """
     wire, offset = replace(wire, column_open=np.float64(column_open)), np.asarray(wire.offset_periods)
     shifted = [replace(wire, offset_periods=offset + np.array([shift, 0.0])) for shift in _SHIFTS]
     errors = (pixels.value - expected_of(one, gains, pixels) for one in shifted)
-    return shifted, np.array([np.sum(error**2 * pixels.weight) for error in errors])
+    chi2 = np.array([np.sum(error**2 * pixels.weight) for error in errors])
+    return [shifted[k] for k in np.argsort(chi2, kind="stable") if chi2[k] <= chi2.min() + margin]
 
 
 def best_of_columns(problem: WireProblem, here: Found, starts: list[Wire]) -> tuple[Found, Float[np.ndarray, "n n"]]:

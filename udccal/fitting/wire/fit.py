@@ -17,7 +17,7 @@ from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.report import coarse
-from udccal.fitting.wire.columns import best_of_columns, shifted_columns
+from udccal.fitting.wire.columns import best_of_columns, likely_columns
 from udccal.fitting.wire.data import Pixels, WireData, flat_noise, pixels_at, sample_pixels
 from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, values_at, weighed_at
 from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
@@ -124,13 +124,10 @@ def _joint(found: Found, every: Pixels, search: Search) -> Joint:
     strengths = strengths_of(full, here.shared, right, chosen)
     kept, x = full.kept(chosen.keep), (x - already + chosen.values)[chosen.keep]
     problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, kept.prior(start, rules))
-    solution, spread = minimise(problem, x, SOLVER), np.zeros((len(x), len(x)))
-    if panel:
-        # On the pixels of the search: by then, columns that are strong enough leave a single place.
-        shifted, chi2 = shifted_columns(descent.wire, descent.gains, descent.problem.pixels, start.column_open)
-        likely = chi2 < chi2.min() + rules.rival * descent.variance
-        others = [one for one, is_likely in zip(shifted, likely, strict=True) if is_likely]
-        solution, spread = best_of_columns(problem, solution, others)
+    # On the pixels of the search: by then, columns that are strong enough leave a single place.
+    searched, margin = descent.problem.pixels, rules.rival * descent.variance
+    others = likely_columns(descent.wire, descent.gains, searched, start.column_open, margin) if panel else []
+    solution, spread = best_of_columns(problem, minimise(problem, x, SOLVER), others)
     # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
     x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)
     seen = weighed_at(kept, x, every, noise)

@@ -16,7 +16,7 @@ from scipy.special import j1
 
 from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.orders import bic
-from udccal.fitting.wire.columns import shifted_columns
+from udccal.fitting.wire.columns import likely_columns
 from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, weighed
 from udccal.fitting.wire.jacobian import WireProblem, rays_at, values_at, weighed_at, with_harmonics
 from udccal.fitting.wire.parameters import parameters_of, shape_sigma, shape_vector, with_shape
@@ -111,8 +111,8 @@ class Search:
             tried += [(sharpness, one) for one in soft if one.criterion < sharp[0].criterion]
         finished = []
         for sharpness, one in tried:
-            shifted, chi2 = shifted_columns(one.wire, one.gains, weights, start.column_open)
-            wire = with_harmonics(shifted[int(np.argmin(chi2))], harmonics, few, sharpness)
+            best, *_ = likely_columns(one.wire, one.gains, weights, start.column_open)
+            wire = with_harmonics(best, harmonics, few, sharpness)
             finished.append(Found(self._descent(wire, one.gains, weights), sample, gain, sharpness))
         return min(finished, key=lambda one: one.descent.criterion)
 
