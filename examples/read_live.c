@@ -46,7 +46,8 @@ int main(int count, char **words) {
         int whole = last == newest && word(slot) == newest; /* last of all */
         for (size_t i = 0; i < bytes; i++) sum += picture[i];
         printf("frame %llu: ", (unsigned long long)frame_id);
-        whole ? printf("mean %.2f\n", (double)sum / bytes) : printf("torn\n");
+        if (whole) printf("mean %.2f\n", (double)sum / bytes);
+        else printf("torn\n");
         fflush(stdout);
     }
     return 0;
