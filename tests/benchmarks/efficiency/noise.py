@@ -25,7 +25,8 @@ from udccal.fitting.noise.transfer import temporal_variance
 _SENSORS, _REALISATIONS = 50, 20
 
 
-# Parameters of the bound: K, V0, c, A, sigma_row^2, black, dark current, DSNU, PRNU, well (all DN), lambda.
+# Parameters of the bound: K, V0, c, A, sigma_row^2, black, dark current, DSNU of pixels, PRNU, well (all DN), lambda,
+# and the parts of DSNU by rows and by columns. The sensors have none, which a fit does not know.
 _K, _V0, _BLACK, _RATE, _SPREAD, _SHAPE = 0, 1, 5, 6, 7, 10
 
 
@@ -45,6 +46,8 @@ def bounds(sensor: ToySensor) -> dict[str, float]:
             sensor.PRNU**2,
             full,
             sensor.shape,
+            0.0,
+            0.0,
         ]
     )
     information = fisher_information(partial(_statistics, sensor), x)
@@ -54,15 +57,16 @@ def bounds(sensor: ToySensor) -> dict[str, float]:
     return dict(zip(truth(sensor), cramer_rao(information, slopes).tolist(), strict=True))
 
 
-def _quantities(x: Float[Array, "11"]) -> Float[Array, "10"]:
-    K, V0, c, _, row2, black, rate, spread2, uneven2, full, shape = x
-    values = [K, black, black + full, jnp.sqrt(V0 + row2) / K, shape, jnp.sqrt(row2), rate / K, jnp.sqrt(spread2) / K]
+def _quantities(x: Float[Array, "13"]) -> Float[Array, "10"]:
+    K, V0, c, _, row2, black, rate, spread2, uneven2, full, shape, by_row2, by_column2 = x
+    offsets = jnp.sqrt(spread2 + by_row2 + by_column2)
+    values = [K, black, black + full, jnp.sqrt(V0 + row2) / K, shape, jnp.sqrt(row2), rate / K, offsets / K]
     return jnp.stack([*values, jnp.sqrt(uneven2), c * full])
 
 
-def _statistics(sensor: ToySensor, x: Float[Array, "11"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def _statistics(sensor: ToySensor, x: Float[Array, "13"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Everything that the frames say, as means of independent normal numbers; their variances are taken for known."""
-    K, V0, c, gain, row2, black, rate, spread2, uneven2, full, shape = x
+    K, V0, c, gain, row2, black, rate, spread2, uneven2, full, shape, by_row2, by_column2 = x
     pixels, frames = sensor.rows * sensor.columns, sensor.stack_frames
     stack_s = sensor.exposure_s(sensor.stack_level)
     parts: list[tuple[Array, Array]] = []
@@ -86,9 +90,14 @@ def _statistics(sensor: ToySensor, x: Float[Array, "11"]) -> tuple[Float[Array, 
         if count > 2:
             tails = excess_kurtosis(sensor.shape) * (V0 / v) ** 2
             parts.append((v, (2 + tails * (1 - 1 / count)) * v**2 / (pixels * (count - 1))))
-    averaged = spread2 + (V0 + 1 / 12 + K * rate * stack_s + row2) / frames
     # The sensor at hand has these patterns; only what is temporal scatters.
-    parts.append((averaged, 2 * (averaged**2 - spread2**2) / pixels))
+    dark = (V0 + 1 / 12 + K * rate * stack_s) / frames
+    for own, temporal, count in (
+        (spread2, dark, pixels),
+        (by_row2 + spread2 / sensor.columns, row2 / frames + dark / sensor.columns, sensor.rows),
+        (by_column2 + spread2 / sensor.rows, dark / sensor.rows, sensor.columns),
+    ):
+        parts.append((own + temporal, 2 * ((own + temporal) ** 2 - own**2) / count))
     z = (gain + rate) * stack_s
     quiet = V0 + 1 / 12 + K * rate * stack_s
     uneven = uneven2 + (temporal_variance(z, K, V0, c, 1 / 12) + quiet) / frames / (gain * stack_s) ** 2
