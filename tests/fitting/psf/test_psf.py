@@ -256,6 +256,19 @@ def test_a_hot_pixel_costs_a_picture_only_next_to_its_led(tmp_path: Path, hot: t
     assert (data.taken, data.dark, data.clipped) == (3, 0, clipped)
 
 
+def test_the_order_of_capture_does_not_number_positions(tmp_path: Path) -> None:
+    session = session_of(tmp_path / "session", 2000, 3)
+    even = np.ones((session.rig.camera.rows, session.rig.camera.columns))
+    backwards = session.manifest.model_copy(update={"steps": session.manifest.steps[::-1]})
+    one, other = (
+        read_psf(each, nominal_noise(session.rig), even).shots for each in (session, Session(session.path, backwards))
+    )
+    assert one is not None
+    assert other is not None
+    np.testing.assert_array_equal(one.positions_px(), other.positions_px())
+    np.testing.assert_array_equal(one.rate, other.rate)
+
+
 def test_where_no_wire_shows_the_rig_says_where_to_start() -> None:
     rig = load_rig("lg55-reduced")
     geometry = nominal_geometry(rig)

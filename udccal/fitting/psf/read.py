@@ -42,7 +42,8 @@ def read_psf(
     kernel, least = kernel_size(session.rig), (rules or PsfRules()).half_px
     half = window_half(session, (max(kernel[0] // 2, least[0]), max(kernel[1] // 2, least[1])))
     crops, aims, dark, clipped, doubted = [], [], 0, 0, list[str]()
-    steps = session.steps("psf")
+    # Positions are chosen by their number, evenly over the field. A person is led through the rows back and forth.
+    steps = sorted(session.steps("psf"), key=lambda step: step.id)
     for step in steps:
         subject = step.subject
         if not isinstance(subject, LedSubject):
