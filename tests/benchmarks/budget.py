@@ -31,10 +31,11 @@ from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight
 from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
 from udccal.restoration.demosaic import demosaic
+from udccal.restoration.filter_tables import filter_tables
 from udccal.restoration.kernel_grid import KernelGrid, interpolated_kernels
 from udccal.restoration.linear import variance_e2
 from udccal.restoration.metrics import encode_srgb, least_squares_gain, psnr
-from udccal.restoration.mosaic_filter import Pattern, Tables, filter_tables, filtered_and_joined
+from udccal.restoration.mosaic_filter import Pattern, Tables, filtered_and_joined
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk

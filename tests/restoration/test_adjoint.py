@@ -8,8 +8,9 @@ from scipy import fft
 
 from udccal.cfa import Cfa, cfa_named
 from udccal.restoration.demosaic import demosaic
+from udccal.restoration.filter_tables import FilterTables, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
-from udccal.restoration.mosaic_filter import FilterTables, filter_tables, prior_density
+from udccal.restoration.scene_prior import prior_density
 from udccal.restoration.site_planes import joined_planes, plane_spectra
 from udccal.restoration.tiles import TileLayout
 

@@ -13,8 +13,9 @@ from udccal.cfa import PATTERNS
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.restoration.clipped import clipped_tiles, completed
+from udccal.restoration.filter_tables import FilterTables, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered
+from udccal.restoration.mosaic_filter import filtered
 from udccal.restoration.tiles import TileLayout, layout_for
 from udccal.rig import RigDescription
 from udccal.tiers import Tier

@@ -9,7 +9,8 @@ import pytest
 
 from udccal.restoration.colour_tables import ColourTables, colour_tables
 from udccal.restoration.kernel_grid import KernelGrid, centred
-from udccal.restoration.mosaic_filter import COLOURS, SPARSE, STRENGTHS, prior_density
+from udccal.restoration.mosaic_filter import SPARSE
+from udccal.restoration.scene_prior import COLOURS, STRENGTHS, prior_density
 from udccal.restoration.tiles import LEAST_PX, layout_for
 
 STRENGTH = np.float32(16.0)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from udccal.cfa import cfa_named
+from udccal.restoration.filter_tables import FilterTables, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid, centred
 from udccal.restoration.lost_detail import lost_detail
-from udccal.restoration.mosaic_filter import COLOURS, STRENGTHS, FilterTables, filter_tables, filtered, prior_density
+from udccal.restoration.mosaic_filter import filtered
+from udccal.restoration.scene_prior import COLOURS, STRENGTHS, prior_density
 from udccal.restoration.tiles import TAPER_PX, TileLayout
 
 SIZE, INDEX, DRAWS = 128, 10, 24

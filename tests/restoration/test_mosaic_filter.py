@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 
 from udccal.cfa import PATTERNS, Cfa
+from udccal.restoration.filter_tables import FilterTables, _tables_of, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import (
-    COLOURS,
-    FilterTables,
-    _tables_of,
-    filter_tables,
-    filtered,
-    prior_density,
-)
+from udccal.restoration.mosaic_filter import filtered
+from udccal.restoration.scene_prior import COLOURS, prior_density
 from udccal.restoration.tiles import TileLayout, layout_for
 
 SIZE = 32

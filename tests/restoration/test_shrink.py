@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from udccal.cfa import PATTERNS
+from udccal.restoration.filter_tables import FilterTables, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, filter_tables, filtered
+from udccal.restoration.mosaic_filter import filtered
+from udccal.restoration.scene_prior import STRENGTHS
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk, split
 from udccal.restoration.tiles import TileLayout, layout_for
 

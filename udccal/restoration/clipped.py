@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Complex64, Float32, Int
 from scipy import fft
 
-from udccal.restoration.mosaic_filter import FilterTables, Pattern
+from udccal.restoration.filter_tables import FilterTables
+from udccal.restoration.mosaic_filter import Pattern
 from udccal.restoration.tiles import TileLayout
 
 # Samples of a tile that clip at least, where the taper leaves more than half of them. Single ones are hot pixels, which

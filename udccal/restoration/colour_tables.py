@@ -21,7 +21,8 @@ from scipy import fft
 
 from udccal.cfa import BLUE, GREEN, RED, Site
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
-from udccal.restoration.mosaic_filter import COLOURFUL, COMMON, SPARSE, power_of, prior_density
+from udccal.restoration.mosaic_filter import SPARSE, power_of
+from udccal.restoration.scene_prior import COLOURFUL, COMMON, prior_density
 from udccal.restoration.tiles import TileLayout
 
 _EVERY = (slice(None), slice(None))

@@ -19,9 +19,9 @@ from jaxtyping import Float, Float32, Int, UInt8, UInt16
 
 from udccal.restoration.lost_detail import LostDetail, lost_detail
 from udccal.restoration.metrics import display_exposure, encode_srgb, least_squares_gain
-from udccal.restoration.mosaic_filter import STRENGTHS
 from udccal.restoration.prepared import kept
 from udccal.restoration.runtime import Restorer
+from udccal.restoration.scene_prior import STRENGTHS
 from udccal.restoration.sharpen import Sharpener, Solved
 from udccal.restoration.shrink import split
 from udccal.tiers import Tier

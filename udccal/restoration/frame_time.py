@@ -22,8 +22,9 @@ from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.clipped import clipped_tiles, completed
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
+from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.linear import to_electrons, variance_e2
-from udccal.restoration.mosaic_filter import FilterTables, filtered, filtered_and_joined
+from udccal.restoration.mosaic_filter import filtered, filtered_and_joined
 from udccal.restoration.network import corrected, noise_planes
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept

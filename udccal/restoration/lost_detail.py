@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from udccal.cfa import Cfa
-from udccal.restoration.mosaic_filter import COLOURS, STRENGTHS, FilterTables, prior_density
+from udccal.restoration.filter_tables import FilterTables
+from udccal.restoration.scene_prior import COLOURS, STRENGTHS, prior_density
 from udccal.restoration.tiles import TileLayout
 
 # Every n-th frequency along both axes is looked at.

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32
 
-from udccal.restoration.mosaic_filter import STRENGTHS
+from udccal.restoration.scene_prior import STRENGTHS
 from udccal.restoration.shrink import interpolated
 from udccal.restoration.tiles import TileLayout
 

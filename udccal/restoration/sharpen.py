@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float32, Float64, Int
 from udccal.cfa import Cfa, cfa_named
 from udccal.restoration.blur import blurred
 from udccal.restoration.clipped import clipped_tiles, completed
+from udccal.restoration.filter_tables import FilterTables, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered, filtered_and_joined
+from udccal.restoration.mosaic_filter import filtered, filtered_and_joined
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept

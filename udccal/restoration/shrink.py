@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy import sparse
 
-from udccal.restoration.mosaic_filter import STRENGTHS, Pattern, Tables, filtered
+from udccal.restoration.mosaic_filter import Pattern, Tables, filtered
+from udccal.restoration.scene_prior import STRENGTHS
 from udccal.restoration.tiles import BLEND_PX, TAPER_PX, Strip, TileLayout
 
 LEVELS, BANDS = 4, 3

@@ -14,8 +14,9 @@ from tests.benchmarks.network.pictures import drawn_picture, photographs
 from udccal.cfa import Cfa, cfa_named
 from udccal.restoration.clipped import completed
 from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
+from udccal.restoration.filter_tables import filter_tables
 from udccal.restoration.kernel_grid import KernelGrid, centred
-from udccal.restoration.mosaic_filter import Pattern, Tables, filter_tables, filtered, filtered_and_joined
+from udccal.restoration.mosaic_filter import Pattern, Tables, filtered, filtered_and_joined
 from udccal.restoration.network import details, noise_planes, sharper
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for

@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from tests.benchmarks.pareto.runs import Sight
+from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.metrics import psnr
-from udccal.restoration.mosaic_filter import COLOURS, FilterTables
 from udccal.restoration.runtime import Restorer, SceneLight
+from udccal.restoration.scene_prior import COLOURS
 from udccal.restoration.sharpen import Sharpener, Solved
 from udccal.tiers import Tier
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.benchmarks.pareto.precision import Kind, Loss, Storage, cheapest, in_double, rounded
+from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import FilterTables
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.runtime import SceneLight
 from udccal.restoration.sharpen import Sharpener

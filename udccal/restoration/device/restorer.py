@@ -20,10 +20,10 @@ from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
 from udccal.restoration.device.tile_filter import TileFilter
 from udccal.restoration.kernel_grid import interpolated_kernels
 from udccal.restoration.linear import dark_DN, least_saturated_DN, variance_floor_e2
-from udccal.restoration.mosaic_filter import STRENGTHS
 from udccal.restoration.network import SHARPER, Weights, network_weights
 from udccal.restoration.rectify import interpolation_taps
 from udccal.restoration.runtime import Restorer
+from udccal.restoration.scene_prior import STRENGTHS
 from udccal.restoration.sharpen import LOCAL_PX
 from udccal.restoration.tone import CODES, Tone
 from udccal.tiers import Tier
