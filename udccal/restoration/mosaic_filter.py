@@ -208,14 +208,17 @@ def _whitened(
 ) -> Complex64[np.ndarray, "sites site_rows site_half"]:
     """Return the tile's samples in units of their noise, less their colours' levels, in the tables' coordinates."""
     cell = pattern.rows, pattern.columns
+    # By place of the cell, of each layer; the samples of a cell's row lie side by side.
+    level, scale = (
+        np.tile(each[channels_of(pattern)].reshape(-1, *cell), tile.shape[-1] // cell[1])
+        for each in (levels, 1 / noise_e)
+    )
     parts = []
-    cells = (each[channels_of(pattern)].reshape(-1, *cell) for each in (levels, 1 / noise_e))
-    for layer, *of_cell in zip(_layers(tile), *cells, strict=True):
-        flat = np.empty_like(layer)
-        for row, (level, scale) in enumerate(zip(*of_cell, strict=True)):
-            line = flat[row :: cell[0]]
-            np.subtract(layer[row :: cell[0]], np.tile(level, layer.shape[1] // cell[1]), out=line)
-            line *= np.tile(scale, layer.shape[1] // cell[1])
+    for layer, own_level, own_scale in zip(_layers(tile), level, scale, strict=True):
+        rows = layer.reshape(-1, cell[0], layer.shape[1])
+        flat = rows - own_level
+        flat *= own_scale
+        flat = flat.reshape(layer.shape)
         flat *= layout.taper
         parts.append(plane_spectra(flat, cell))
     spectrum = parts[0] if len(parts) == 1 else np.concatenate(parts)
@@ -236,23 +239,14 @@ def _picture(
     cell, channels = (pattern.rows, pattern.columns), channels_of(pattern)
     matched = tables.matched
     mixed = np.zeros((len(COLOURS), len(matched), *by_site.shape[1:]), dtype=np.complex64)
-    for colour, spectrum in enumerate(mixed):
-        own = _evenly(np.flatnonzero(channels == colour))
-        np.sum(matched[:, own] * by_site[own], axis=1, out=spectrum)
+    for site, colour in enumerate(channels):
+        mixed[colour] += matched[:, site] * by_site[site]
     # Colours have much that cancels in their sum. In single precision, they are mixed before they become pictures.
     common = mixed.sum(axis=0)
     common *= np.float32(COMMON)
     mixed += common
     planes = joined_planes(mixed, cell, layout.columns)
     return cv2.transform(cv2.merge(list(planes)), np.column_stack([np.diag(COLOURFUL * noise_e), levels]))
-
-
-def _evenly(sites: Int[np.ndarray, " some"]) -> slice | Int[np.ndarray, " some"]:
-    """Return indices as a slice, which needs no copy, where they are two at most."""
-    if not 1 <= len(sites) <= 2:
-        return sites
-    first, last = int(sites[0]), int(sites[-1])
-    return slice(first, last + 1, max(last - first, 1))
 
 
 def _likeliest(costs: Callable[[Float32[np.ndarray, " some"]], Float32[np.ndarray, " some"]]) -> np.float32:
