@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from udccal.restoration.colour_tables import ColourTables, colour_tables
+from udccal.restoration.filter_tables import SPARSE
 from udccal.restoration.kernel_grid import KernelGrid, centred
-from udccal.restoration.mosaic_filter import SPARSE
 from udccal.restoration.scene_prior import COLOURS, STRENGTHS, prior_density
 from udccal.restoration.tiles import LEAST_PX, layout_for
 

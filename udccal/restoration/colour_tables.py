@@ -20,8 +20,8 @@ from jaxtyping import Complex64, Float32, Int
 from scipy import fft
 
 from udccal.cfa import BLUE, GREEN, RED, Site
+from udccal.restoration.filter_tables import SPARSE, power_of
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
-from udccal.restoration.mosaic_filter import SPARSE, power_of
 from udccal.restoration.scene_prior import COLOURFUL, COMMON, prior_density
 from udccal.restoration.tiles import TileLayout
 

@@ -17,9 +17,12 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64, Int
 from scipy import fft
 
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
-from udccal.restoration.mosaic_filter import SPARSE, Pattern, power_of
+from udccal.restoration.mosaic_filter import Pattern
 from udccal.restoration.scene_prior import COLOURS, prior_density
 from udccal.restoration.tiles import TileLayout
+
+# Every n-th frequency along both axes decides the strength.
+SPARSE = 3
 
 
 @final
@@ -69,6 +72,11 @@ class FilterTables:
         weighted = np.conjugate(along)
         weighted *= 1 / (self.values + 1 / strength)
         return np.conjugate(_products(self.vectors.swapaxes(0, 1), weighted), out=weighted)
+
+
+def power_of(values: Complex64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    """Return the square of each number's size."""
+    return values.real**2 + values.imag**2
 
 
 def filter_tables(grid: KernelGrid, layout: TileLayout, pattern: Pattern, workers: int) -> FilterTables:

@@ -30,8 +30,6 @@ from udccal.restoration.scene_prior import COLOURFUL, COLOURS, COMMON, STRENGTHS
 from udccal.restoration.site_planes import joined_planes, plane_spectra
 from udccal.restoration.tiles import TileLayout
 
-# Every n-th frequency along both axes decides the strength.
-SPARSE = 3
 # Every n-th strength is tried first, then those around the likeliest.
 _STRIDE, _HALF_STEPS = 4, (2, 1)
 # Every n-th row of cells gives a tile's level.
@@ -82,11 +80,6 @@ class Tables(Protocol):
         self, along: Complex64[np.ndarray, "sites rows half"], strength: np.float32
     ) -> Complex64[np.ndarray, "sites rows half"]:
         """Return (B + 1 / s)^-1 Y; ``along`` may be overwritten."""
-
-
-def power_of(values: Complex64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """Return the square of each number's size."""
-    return values.real**2 + values.imag**2
 
 
 def filtered(

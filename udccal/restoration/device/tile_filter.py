@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Complex64, Float, Int
 from udccal.cfa import Cfa
 from udccal.restoration.clipped import HALF, LEAST, ROUNDS, STEPS
 from udccal.restoration.device.planes import Mosaic, apart, cut, joined, placing, together
-from udccal.restoration.mosaic_filter import LEVEL_ROWS, SPARSE, channels_of
+from udccal.restoration.filter_tables import SPARSE
+from udccal.restoration.mosaic_filter import LEVEL_ROWS, channels_of
 from udccal.restoration.scene_prior import COLOURFUL, COMMON, STRENGTHS
 from udccal.restoration.sharpen import SPARSE_CELLS, tile_ends
 from udccal.restoration.tiles import TileLayout
