@@ -12,7 +12,7 @@ from tests.scenes.wire import start
 from udccal.fitting.wire.data import FlatNoise, weighed
 from udccal.fitting.wire.jacobian import expected_of
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
-from udccal.fitting.wire.weak import Omitted, harmonics_alone, omitted
+from udccal.fitting.wire.weak import Omitted, Strengths, harmonics_alone, omitted, tied_sigma
 from udccal.models.wire import Wire
 
 START, RULES = start(), WireRules()
@@ -72,3 +72,19 @@ def test_extreme_shares_have_a_probability() -> None:
     for share, sigma in ((0.0, 1e150), (40.0, 1e-6), (-40.0, 1e-6), (1.0, 1e-9), (0.0, 1e-9)):
         probability = Omitted(1e-4, share, sigma).probability
         assert 0.0 <= probability <= 1.0
+
+
+def test_weak_harmonics_may_differ_by_more_than_the_strong_ones_show() -> None:
+    """As of rounded openings: strong harmonics are a round pupil's within 1 %, those not fitted are off by half."""
+    rng, strong = np.random.default_rng(3), np.arange(20) < 10
+    known = np.where(strong, 1e6, 20.0)
+    real = np.where(strong, 0.01, 0.5) * rng.standard_normal(20)
+    strengths = Strengths(real + rng.standard_normal(20) / np.sqrt(known), known, ~strong)
+    with jax.enable_x64(True):
+        few = ideal_wire(GEOMETRY, START, possible_harmonics(START).orders[:20])
+        pixels = even_pixels(few, NOISE, 0)
+        line = FlatNoise(np.full(4, NOISE**2), np.zeros(4), 0.0, np.full(4, np.inf))
+        seen = weighed(pixels, expected_of(few, np.ones(4), pixels), line)
+    of_all = np.sum(seen.pixels.weight * seen.expected**2)
+    error = np.sqrt(real[~strong] ** 2 @ known[~strong] / of_all)
+    assert 0.7 < tied_sigma(strengths, few, seen, 1.0) / error < 2.0

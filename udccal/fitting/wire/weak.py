@@ -61,15 +61,22 @@ def tied_sigma(strengths: Strengths, wire: Wire, seen: Weighed, variance: float)
     if not held.any():
         return 0.0
     off, own = strengths.off[held], variance / strengths.known[held]
-    found, error2, _ = excess_variance(off**2, own, np.ones(len(off)))
-    # Few strengths tell how much they differ: what they may differ by more counts, too.
-    part2 = found + float(np.sqrt(error2)) if found > 0 else 0.0
+    # Openings that are no rectangles change weak harmonics by a larger part than strong ones.
+    weak = own >= np.median(own)
+    part2 = max(_departure(off, own), _departure(off[weak], own[weak]))
     shrunk = part2 / np.maximum(part2 + own, 1e-300)
     square = np.where(strengths.tied[held], (shrunk * off) ** 2 + shrunk * own, 0.0)
     effect = square @ strengths.known[held] / np.sum(seen.pixels.weight * seen.expected**2)
     others = wire.harmonics[~held]
     alone = harmonics_alone(wire, others, seen.pixels.thinned(BLOCK)) if part2 > 0 and len(others) else np.zeros(1)
     return float(np.sqrt(effect + part2 * np.var(alone)))
+
+
+def _departure(off: Float[np.ndarray, " some"], own: Float[np.ndarray, " some"]) -> float:
+    """Mean square part by which strengths differ, beyond their own variance."""
+    found, error2, _ = excess_variance(off**2, own, np.ones(len(off)))
+    # Few strengths tell how much they differ: what they may differ by more counts, too.
+    return found + float(np.sqrt(error2)) if found > 0 else 0.0
 
 
 @final
