@@ -9,6 +9,7 @@ import numpy as np
 from udccal.calibration import ORDER, Calibration
 from udccal.errors import UdccalError
 from udccal.fitting.geometry.fit import projection_sigma_px
+from udccal.numerics import in_two_threads
 from udccal.planning.forecast import Curve, Forecast, forecast
 from udccal.planning.state import measured_state, sensor_samples
 from udccal.reports.tables import Table
@@ -47,20 +48,21 @@ class Accuracy:
 def accuracies(calibration: Calibration) -> tuple[Accuracy, ...]:
     """Return the accuracy of each fitted term; leave out terms whose procedure does not describe its captures."""
     state = measured_state(calibration.rig, calibration)
-    found = []
-    for term in ORDER:
+
+    def of(term: TermName) -> Accuracy | None:
         result = calibration.result(term)
-        if result.status is not FitStatus.CONVERGED:
-            continue
         try:
             ahead = forecast(term, state)
         except UdccalError:
-            continue
-        if ahead is not None:
-            used = _diagnostic(result, "efficiency")
-            used = ahead.limits.used if used is None else used
-            found.append(Accuracy(ahead, stated(term, result, calibration.rig), used))
-    return tuple(found)
+            return None
+        if ahead is None:
+            return None
+        used = _diagnostic(result, "efficiency")
+        return Accuracy(ahead, stated(term, result, calibration.rig), ahead.limits.used if used is None else used)
+
+    terms = [term for term in ORDER if calibration.result(term).status is FitStatus.CONVERGED]
+    found = in_two_threads(of, terms) if terms else []
+    return tuple(accuracy for accuracy in found if accuracy is not None)
 
 
 def stated(term: TermName, result: FitResult, rig: RigDescription) -> float | None:
