@@ -14,8 +14,8 @@ from jaxtyping import Float, Int, Shaped
 
 from procedures.metering import spot_light
 from udccal.arrangements import BoardSpec
+from udccal.board.charuco import board_points_mm, charuco_board
 from udccal.cameras.protocol import Frame
-from udccal.fitting.geometry.corners import board_points_mm, charuco_board
 from udccal.guide.events import Outline, Reading
 from udccal.mounting import nominal_rotation
 from udccal.rig import RigDescription

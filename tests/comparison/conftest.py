@@ -9,9 +9,9 @@ import pytest
 
 from tests.profiles import conftest as profiles
 from udccal.fitting.geometry.bundle import INTRINSIC_NAMES
-from udccal.fitting.geometry.fit import angles_deg
 from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.models.noise import Noise
+from udccal.mounting import angles_deg
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import load_profile

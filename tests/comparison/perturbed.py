@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from udccal.fitting.geometry.fit import angles_deg
+from udccal.mounting import angles_deg
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult
 from udccal.sessions.schema import TermName

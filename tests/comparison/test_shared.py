@@ -16,11 +16,12 @@ from tests.scenes.psf import shots_of as led_shots
 from udccal.comparison.held import held_estimates
 from udccal.comparison.shared import _made_up
 from udccal.fitting.backscatter.fit import fit_backscatter
-from udccal.fitting.geometry.fit import angles_deg, term_at
+from udccal.fitting.geometry.fit import term_at
 from udccal.fitting.psf.data import PsfData, PsfRules
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.kernel import pack, start_model
 from udccal.models.geometry import unproject
+from udccal.mounting import angles_deg
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
 

@@ -10,8 +10,8 @@ import pytest
 
 from procedures.geometry import board_poses, board_spec
 from udccal.arrangements import Board, Occasion
+from udccal.board.charuco import board_points_mm
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import rig_prior
 from udccal.planning.geometry import BoardView, BoardViews, NextView
 from udccal.planning.state import RigState, nominal_state

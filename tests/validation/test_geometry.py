@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from tests.profiles.conftest import fitted
 from tests.validation.judged import failed, named
 from udccal.arrangements import BoardSpec
+from udccal.board.charuco import board_points_mm
 from udccal.fitting.geometry.bundle import Intrinsics
-from udccal.fitting.geometry.corners import BoardCorners, board_points_mm
+from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.data import BoardView
 from udccal.models.geometry import Geometry
 from udccal.result import Diagnostic, FitResult

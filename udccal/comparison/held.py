@@ -15,8 +15,8 @@ from udccal.comparison.comparable import check_finite
 from udccal.comparison.estimates import ANGLES, ORDER, Estimates, Name, within_half_turn
 from udccal.comparison.shared import Measured, with_shared
 from udccal.errors import ProfileError
-from udccal.fitting.geometry.fit import angles_deg
 from udccal.fitting.wire.parameters import SHAPE_NAMES
+from udccal.mounting import angles_deg
 from udccal.result import FitResult
 
 _ROTATION, _TURN_STEP_DEG = SHAPE_NAMES[:3], 1e-3

@@ -16,10 +16,11 @@ from scipy.optimize import least_squares
 from udccal.comparison.comparable import check_finite
 from udccal.comparison.grid import kernel_places, light_step, sensor_grid
 from udccal.comparison.shared import STEPS
-from udccal.fitting.geometry.fit import angles_deg, term_at
+from udccal.fitting.geometry.fit import term_at
 from udccal.kernels import fitted_size, kernels_at
 from udccal.models.backscatter import Backscatter, PanelResponse, grid_positions, panel_response, response_grid
 from udccal.models.geometry import Geometry, panel_directions, project_directions
+from udccal.mounting import angles_deg
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult

@@ -23,9 +23,10 @@ from udccal.comparison.comparable import check_finite
 from udccal.comparison.estimates import ANGLES, Estimates, Name
 from udccal.comparison.grid import sensor_grid
 from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS
-from udccal.fitting.geometry.fit import angles_deg, term_at
+from udccal.fitting.geometry.fit import term_at
 from udccal.fitting.wire.parameters import SHAPE_NAMES
 from udccal.models.geometry import Geometry, unproject
+from udccal.mounting import angles_deg
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
 from udccal.rig import RigDescription

@@ -15,8 +15,8 @@ from udccal.drift.causes import CAUSES
 from udccal.drift.check import RigCheck, Solved
 from udccal.drift.gain import GainRatio
 from udccal.drift.moved import moved_backscatter, moved_geometry, moved_psf, moved_wire, movement_mm
-from udccal.fitting.geometry.fit import angles_deg
 from udccal.fitting.wire.fit import sensor_map
+from udccal.mounting import angles_deg
 from udccal.profiles.archive import unpack_archive
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import profile_sha256, provenance_now

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from udccal.arrangements import Board, BoardSpec
+from udccal.board.charuco import board_points_mm, charuco_board
 from udccal.fitting.engine.gaussian import Posterior, scaled_inverse
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.geometry.bundle import (
@@ -30,7 +31,6 @@ from udccal.fitting.geometry.bundle import (
     Points,
     projected,
 )
-from udccal.fitting.geometry.corners import board_points_mm, charuco_board
 from udccal.fitting.geometry.data import best_poses, gather, rig_prior
 from udccal.fitting.geometry.fit import projection_sigma_px, term_at, with_angles
 from udccal.numerics import in_float64

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from udccal.board.charuco import board_points_mm
 from udccal.fitting.geometry.bundle import Intrinsics
-from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import BoardView
 from udccal.models.geometry import Geometry
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from udccal.models.geometry import Geometry
+from udccal.mounting import angles_deg
 from udccal.sessions.schema import TermName
 from udccal.simulation.emission import EMITTER_COLUMN_OFFSETS, EMITTER_ROW_OFFSET
 from udccal.simulation.truth import RigTruth
@@ -57,10 +58,10 @@ def _noise(truth: RigTruth) -> tuple[TrueValue, ...]:
 
 def _geometry(truth: RigTruth) -> tuple[TrueValue, ...]:
     optics = truth.optics
-    yaw, tilt, roll = Rotation.from_matrix(optics.R_panel_camera).as_euler("YXZ", degrees=True)
+    turn_deg = angles_deg(Rotation.from_matrix(optics.R_panel_camera).as_rotvec())
     lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), optics.distortion, strict=True))
     frame = {"fx": optics.fx_px, "fy": optics.fy_px, "cx": optics.cx_px, "cy": optics.cy_px}
-    angles = {"tilt_deg": -tilt, "roll_deg": roll, "yaw_deg": yaw}
+    angles = dict(zip(("tilt_deg", "roll_deg", "yaw_deg"), turn_deg, strict=True))
     turned = (TrueValue("geometry", name, float(value), 360.0) for name, value in angles.items())
     return (*_of("geometry", frame | lens), *turned)
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from udccal.board.charuco import board_points_mm
 from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.geometry.bundle import (
     INTRINSIC_NAMES,
@@ -22,7 +23,6 @@ from udccal.fitting.geometry.bundle import (
     solve,
 )
 from udccal.fitting.geometry.calibrated import rms_px
-from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import BoardView, best_poses, gather, read_geometry
 from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
 from udccal.models.geometry import Geometry

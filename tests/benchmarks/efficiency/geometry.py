@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 from tests.benchmarks.efficiency.trials import Trials
 from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, calibrated, sight
 from tests.scenes.information import fisher_information
+from udccal.board.charuco import board_points_mm
 from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.geometry.bundle import LENS, Intrinsics
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
-from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import GeometryData
 from udccal.fitting.geometry.fit import fit_boards, projection_sigma_px
 from udccal.models.geometry import Geometry, project, rotation_matrix

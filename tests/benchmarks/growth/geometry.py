@@ -10,7 +10,7 @@ import numpy as np
 from tests.benchmarks.growth.cases import Case
 from tests.fitting.geometry.boards import sight
 from udccal.arrangements import BoardSpec
-from udccal.fitting.geometry.corners import board_points_mm
+from udccal.board.charuco import board_points_mm
 from udccal.fitting.geometry.data import GeometryData
 from udccal.fitting.geometry.fit import fit_boards
 from udccal.models.geometry import Geometry

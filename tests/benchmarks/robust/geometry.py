@@ -10,9 +10,9 @@ from tests.benchmarks.efficiency.geometry import corners_seen
 from tests.benchmarks.robust.family import Answer, Case, Family, Number, of_result
 from tests.fitting.geometry.boards import Sight, sight
 from tests.scenes.information import fisher_information
+from udccal.board.charuco import board_points_mm
 from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.geometry.bundle import LENS, Intrinsics
-from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.fit import fit_geometry
 from udccal.numerics import in_float64
 

@@ -13,7 +13,7 @@ from tests.benchmarks.robust.family import Answer, Case, Family, Number, all_fin
 from tests.fitting.geometry.boards import sight
 from tests.scenes import wire as wires
 from tests.scenes.noise import PLAIN, expose, patterns, truth
-from udccal.fitting.geometry.corners import board_points_mm
+from udccal.board.charuco import board_points_mm
 from udccal.fitting.geometry.fit import fit_geometry
 from udccal.fitting.hdr.merge import merge_bracket
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack

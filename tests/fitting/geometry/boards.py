@@ -11,8 +11,9 @@ import jax
 import numpy as np
 
 from udccal.arrangements import BoardSpec
+from udccal.board.charuco import board_points_mm, charuco_board
 from udccal.fitting.geometry.calibrated import CalibratedViews
-from udccal.fitting.geometry.corners import BoardCorners, board_points_mm, charuco_board
+from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.data import BoardView, gather
 from udccal.fitting.geometry.views import calibrate_views
 from udccal.models.geometry import Geometry, mounting_rotation, project, unproject

@@ -8,10 +8,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, calibrated, sight
+from udccal.board.charuco import board_points_mm
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.geometry.calibrated import CalibratedViews
-from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.fit import fit_geometry, projection_sigma_px
 from udccal.models.geometry import Geometry
 from udccal.result import FitStatus

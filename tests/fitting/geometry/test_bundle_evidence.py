@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.fitting.geometry.boards import calibrated, sight
 from tests.fitting.geometry.test_bundle import SCENE, arrays
+from udccal.board.charuco import board_points_mm
 from udccal.errors import FitError
 from udccal.fitting.geometry.bundle import ORDERS, Intrinsics, projected
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
-from udccal.fitting.geometry.corners import board_points_mm
 from udccal.result import FitStatus
 
 PIXELS = np.array([[511.0, 383.0], [40.0, 60.0], [980.0, 700.0]])

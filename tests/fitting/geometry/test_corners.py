@@ -6,8 +6,9 @@ from scipy.ndimage import convolve1d
 
 from tests.fitting.geometry.boards import SIZE, SPEC, draw, pose, true_corners
 from udccal.arrangements import BoardSpec
+from udccal.board.charuco import board_points_mm, charuco_board
 from udccal.errors import FitError
-from udccal.fitting.geometry.corners import Luminance, board_points_mm, charuco_board, detect_corners, luminance
+from udccal.fitting.geometry.corners import Luminance, detect_corners, luminance
 from udccal.fitting.geometry.data import flat_field
 
 GAINS = np.array([[0.6, 1.0], [1.0, 0.7]])

@@ -19,11 +19,12 @@ from tests.fitting.geometry.boards import (
     sight,
     true_corners,
 )
+from udccal.board.charuco import board_points_mm
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.geometry.calibrated import CalibratedViews
-from udccal.fitting.geometry.corners import BoardCorners, board_points_mm
+from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.data import BoardView, GeometryData, read_geometry, rig_prior
 from udccal.fitting.geometry.fit import fit_boards, projection_sigma_px
 from udccal.fitting.noise.fit import nominal_noise

@@ -15,16 +15,17 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from udccal.board.charuco import board_points_mm
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, USUAL, GeometryRules, Intrinsics
 from udccal.fitting.geometry.calibrated import CalibratedViews, turn_with
-from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import BoardView, GeometryData, gather
 from udccal.fitting.geometry.views import calibrate_views
 from udccal.models.geometry import Geometry, panel_directions, project_directions
+from udccal.mounting import angles_deg, turned_by
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
@@ -263,17 +264,10 @@ def with_angles(
     return np.append(intrinsics, angles[6]), picks @ cov @ picks.T
 
 
-def angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """(tilt, roll, yaw) of R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
-    yaw, tilt, roll = Rotation.from_rotvec(rotation).as_euler("YXZ", degrees=True)
-    return np.array([-tilt, roll, yaw])
-
-
 def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
     """The term of ``x``: intrinsics, tilt, roll and yaw in degrees; ``pupil`` in mm in panel coordinates."""
-    lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
-    rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()
-    return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, np.asarray(rotation), pupil)
+    lens = Intrinsics.of(x[:LENS])
+    return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, turned_by(x[LENS:]), pupil)
 
 
 def _outliers(
