@@ -16,20 +16,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Complex64, Float32, Int
-from scipy import fft
+from jaxtyping import Bool, Float32, Int
 
 from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.mosaic_filter import Pattern
+from udccal.restoration.site_planes import joined_planes, plane_spectra
 from udccal.restoration.tiles import TileLayout
 
 # Samples of a tile that clip at least, where the taper leaves more than half of them. Single ones are hot pixels, which
 # have been replaced.
 LEAST, HALF = 8, 0.5
-# More steps give more: of the photograph with the largest lamps, 8 give 0.35 dB, 24 0.5 dB, 100 1.4 dB.
-ROUNDS, STEPS = 2, 4
+# Twice as many steps take twice the time, and give 0.005 dB over nineteen scenes. One round loses 0.02 dB; none loses
+# 0.07 dB, or 0.5 dB where lamps are in view.
+ROUNDS, STEPS = 2, 2
+
+Mosaic: TypeAlias = Float32[np.ndarray, "rows columns"]
 
 
 def clipped_tiles(
@@ -72,8 +76,7 @@ def completed(
     """
 
     def one(index: int) -> Float32[np.ndarray, "rows columns"]:
-        weight = 1 / (strengths[index] * tables.values[index] + 1)
-        own = tiles[index], clipped[index], noise_e[index], tables.vectors[index], weight
+        own = tiles[index], clipped[index], noise_e[index], strengths[index], tables.at(index)
         return _completed(*own, layout.taper, pattern)
 
     with ThreadPoolExecutor(workers) as pool:
@@ -81,44 +84,34 @@ def completed(
 
 
 def _completed(
-    tile: Float32[np.ndarray, "rows columns"],
+    tile: Mosaic,
     clipped: Bool[np.ndarray, "rows columns"],
     noise_e: Float32[np.ndarray, "3"],
-    vectors: Complex64[np.ndarray, "sites sites site_rows site_half"],
-    weight: Float32[np.ndarray, "sites site_rows site_half"],
-    window: Float32[np.ndarray, "rows columns"],
+    strength: np.float32,
+    tables: FilterTables,
+    taper: Mosaic,
     pattern: Pattern,
-) -> Float32[np.ndarray, "rows columns"]:
-    """Complete one tile by the eigenvectors of its precision, and their ``weight``: its eigenvalues."""
-    planes, missing, taper = (
-        np.stack([whole[site.samples] for site in pattern.sites]) for whole in (tile, clipped, window)
-    )
-    level = planes.mean(axis=(1, 2), keepdims=True)
-    scale = noise_e[[site.channel for site in pattern.sites], None, None]
+) -> Mosaic:
+    """Complete one tile."""
+    level, scale = np.empty_like(tile), np.empty_like(tile)
+    for site in pattern.sites:
+        level[site.samples], scale[site.samples] = tile[site.samples].mean(), noise_e[site.channel]
 
-    def precision(of: Float32[np.ndarray, "sites _ _"]) -> Float32[np.ndarray, "sites _ _"]:
-        own = np.einsum("ksyx,syx->kyx", vectors, fft.rfft2(taper * of)) * weight
-        back: Float32[np.ndarray, "sites _ _"] = fft.irfft2(
-            np.einsum("ksyx,kyx->syx", np.conj(vectors), own), s=planes.shape[1:]
-        )
-        return taper * back
+    def precision(of: Mosaic) -> Mosaic:
+        """Return s T (s B + 1)^-1 T Y: the factor s changes no solution."""
+        spectra = tables.solved(tables.along(plane_spectra(taper * of, (pattern.rows, pattern.columns))), strength)
+        joined = joined_planes(spectra[None], (pattern.rows, pattern.columns), tile.shape[1])[0]
+        return np.multiply(joined, taper, out=joined)
 
-    least = (planes - level) / scale
-    found, free = least.copy(), missing
+    least = (tile - level) / scale
+    found, free = least.copy(), clipped
     for _ in range(ROUNDS):
-        found = np.where(missing, np.maximum(_solved(found, free, precision), least), least)
-        free = missing & (found > least)
-    picture = tile.copy()
-    for site, own, values in zip(pattern.sites, missing, found * scale + level, strict=True):
-        picture[site.samples] = np.where(own, values, picture[site.samples])
-    return picture
+        found = np.where(clipped, np.maximum(_solved(found, free, precision), least), least)
+        free = clipped & (found > least)
+    return np.where(clipped, found * scale + level, tile)
 
 
-def _solved(
-    start: Float32[np.ndarray, "sites rows columns"],
-    free: Bool[np.ndarray, "sites rows columns"],
-    precision: Callable[[Float32[np.ndarray, "sites _ _"]], Float32[np.ndarray, "sites _ _"]],
-) -> Float32[np.ndarray, "sites rows columns"]:
+def _solved(start: Mosaic, free: Bool[np.ndarray, "rows columns"], precision: Callable[[Mosaic], Mosaic]) -> Mosaic:
     """Return likelier values of the free samples: some steps of conjugate gradients from ``start``."""
     found, rest = start.copy(), -precision(start) * free
     step, power = rest, float(np.vdot(rest, rest))

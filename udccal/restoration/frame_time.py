@@ -24,7 +24,7 @@ from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.linear import to_electrons, variance_e2
-from udccal.restoration.mosaic_filter import filtered, filtered_and_joined
+from udccal.restoration.mosaic_filter import filtered_and_joined, likeliest_strengths
 from udccal.restoration.network import corrected, noise_planes
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -153,7 +153,7 @@ def _measured(options: PlanOptions) -> PartTimes:
     clipped = np.broadcast_to(rng.random(tiles.shape[1:]) < _CLIPPED, tiles.shape)
 
     def completion() -> None:
-        completed(tiles, clipped, filtered(tiles, *given)[1], *given)
+        completed(tiles, clipped, likeliest_strengths(tiles, *given), *given)
 
     def network() -> None:
         planes = noise_planes(bands, unit, signal, layout)

@@ -128,6 +128,25 @@ def filtered_and_joined(
     return joined, _filter_each(*given, layout.apart, lambda index, picture: layout.blend(picture, index, joined))
 
 
+def likeliest_strengths(
+    tiles: Tiles,
+    noise_e: Float32[np.ndarray, "tiles 3"],
+    tables: Tables,
+    layout: TileLayout,
+    pattern: Pattern,
+    workers: int,
+) -> Float32[np.ndarray, " tiles"]:
+    """Return the strength of the prior that each tile chooses. Arguments are those of ``filtered``."""
+
+    def one(index: int) -> np.float32:
+        own = tables.at(index)
+        levels = _levels(tiles[index], pattern)
+        return _chosen(_whitened(tiles[index], levels, noise_e[index], own, layout, pattern), own, layout, pattern)
+
+    with ThreadPoolExecutor(workers) as pool:
+        return np.array(list(pool.map(one, range(len(tiles)))), dtype=np.float32)
+
+
 def _filter_each(
     tiles: Tiles,
     noise_e: Float32[np.ndarray, "tiles 3"],
@@ -164,8 +183,7 @@ def _filtered_tile(
     levels = _levels(tile, pattern)
     spectrum = _whitened(tile, levels, noise_e, tables, layout, pattern)
     if strength is None:
-        samples = layout.power / (pattern.rows * pattern.columns)
-        strength = _likeliest(tables.costs(spectrum, samples))
+        strength = _chosen(spectrum, tables, layout, pattern)
     return _picture(spectrum, strength, levels, noise_e, tables, layout, pattern), strength
 
 
@@ -240,6 +258,13 @@ def _picture(
     mixed += common
     planes = joined_planes(mixed, cell, layout.columns)
     return cv2.transform(cv2.merge(list(planes)), np.column_stack([np.diag(COLOURFUL * noise_e), levels]))
+
+
+def _chosen(
+    whitened: Complex64[np.ndarray, "sites site_rows site_half"], tables: Tables, layout: TileLayout, pattern: Pattern
+) -> np.float32:
+    """Return the strength that a tile chooses."""
+    return _likeliest(tables.costs(whitened, layout.power / (pattern.rows * pattern.columns)))
 
 
 def _likeliest(costs: Callable[[Float32[np.ndarray, " some"]], Float32[np.ndarray, " some"]]) -> np.float32:

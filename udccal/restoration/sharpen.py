@@ -15,7 +15,7 @@ from udccal.restoration.blur import blurred
 from udccal.restoration.clipped import clipped_tiles, completed
 from udccal.restoration.filter_tables import FilterTables, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import filtered, filtered_and_joined
+from udccal.restoration.mosaic_filter import filtered_and_joined, likeliest_strengths
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -163,7 +163,7 @@ class Sharpener:
         if len(at):
             given = noise_e[at], self.tables.at(at), *self._given[1:]
             own = np.stack([tiles[index] for index in at])
-            whole = completed(own, missing, filtered(own, *given)[1], *given)
+            whole = completed(own, missing, likeliest_strengths(own, *given), *given)
             for index, tile in zip(at, whole, strict=True):
                 tiles[index] = tile
         return _Filtered(tiles, *filtered_and_joined(tiles, noise_e, *self._given), noise_e)
