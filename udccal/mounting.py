@@ -13,7 +13,7 @@ def nominal_rotation(rig: RigDescription) -> Float[np.ndarray, "3 3"]:
     """Return the nominal R_panel_camera of ``rig``."""
     mounting = rig.mounting
     turn_deg = np.array([mounting.tilt_deg.value, mounting.roll_deg.value, mounting.yaw_deg.value])
-    return np.asarray(Rotation.from_rotvec(turned_by(turn_deg)).as_matrix(), dtype=np.float64)
+    return np.asarray(_rotation(turn_deg).as_matrix(), dtype=np.float64)
 
 
 def nominal_pupil_mm(rig: RigDescription) -> Float[np.ndarray, "3"]:
@@ -28,8 +28,12 @@ def turned_by(turn_deg: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     Args:
         turn_deg: tilt, roll and yaw.
     """
+    return np.asarray(_rotation(turn_deg).as_rotvec())
+
+
+def _rotation(turn_deg: Float[np.ndarray, "3"]) -> Rotation:
     tilt, roll, yaw = turn_deg
-    return np.asarray(Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec())
+    return Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True)
 
 
 def angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

@@ -75,7 +75,7 @@ def completed(
         workers: threads.
     """
 
-    def one(index: int) -> Float32[np.ndarray, "rows columns"]:
+    def one(index: int) -> Mosaic:
         own = tiles[index], clipped[index], noise_e[index], strengths[index], tables.at(index)
         return _completed(*own, layout.taper, pattern)
 
@@ -93,14 +93,14 @@ def _completed(
     pattern: Pattern,
 ) -> Mosaic:
     """Complete one tile."""
-    level, scale = np.empty_like(tile), np.empty_like(tile)
+    cell, level, scale = (pattern.rows, pattern.columns), np.empty_like(tile), np.empty_like(tile)
     for site in pattern.sites:
         level[site.samples], scale[site.samples] = tile[site.samples].mean(), noise_e[site.channel]
 
     def precision(of: Mosaic) -> Mosaic:
         """Return s T (s B + 1)^-1 T Y: the factor s changes no solution."""
-        spectra = tables.solved(tables.along(plane_spectra(taper * of, (pattern.rows, pattern.columns))), strength)
-        joined = joined_planes(spectra[None], (pattern.rows, pattern.columns), tile.shape[1])[0]
+        spectra = tables.solved(tables.along(plane_spectra(taper * of, cell)), strength)
+        joined = joined_planes(spectra[None], cell, tile.shape[1])[0]
         return np.multiply(joined, taper, out=joined)
 
     least = (tile - level) / scale
