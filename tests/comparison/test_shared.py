@@ -54,6 +54,7 @@ def test_the_wires_pose_makes_up_for_an_error_of_the_lens(measured: Profile) -> 
 
 
 @pytest.mark.parametrize("off", [np.eye(12)[0] * 0.5 + np.eye(12)[1] * 0.5, np.eye(12)[9] * 0.2, np.eye(12)[11] * -0.2])
+@pytest.mark.medium
 def test_backscatter_makes_up_for_an_error_of_lens_or_rotation(off: np.ndarray) -> None:
     """Against its fit of the same light, with another geometry held."""
     rng, rig = np.random.default_rng(4), small_rig()

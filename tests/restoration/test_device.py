@@ -198,6 +198,7 @@ def test_what_a_device_cannot_do_is_refused(restorers: dict[Tier, Restorer]) -> 
 
 @pytest.mark.parametrize("light_e", [-5e4, -2000.0, -30.0, -1.0, 0.5, 40.0])
 @pytest.mark.parametrize("sigma_e", [1e-6, 2.0, 200.0])
+@pytest.mark.medium
 def test_dark_places_are_those_of_the_cpu_however_far_below_zero(light_e: float, sigma_e: float) -> None:
     picture = np.broadcast_to(np.float32([1.0, 0.5, 1.5]) * np.float32(light_e), (64, 80, 3)).copy()
     error = np.full(picture.shape[:2], sigma_e, np.float32)

@@ -107,6 +107,7 @@ def test_a_frame_of_another_camera_is_refused_first(
 
 
 @pytest.mark.usefixtures("quick")
+@pytest.mark.medium
 def test_a_frame_that_clips_is_expected_to_take_longer(profile: Profile, frame: np.ndarray) -> None:
     lamp = frame.copy()
     lamp[25:35, 40:60] = 3969

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.chromium import Page, chromium
 from tests.web.looks import SIZES, check_layout, says, see_the_picture
 from tests.web.serving import Served, played
@@ -52,6 +54,7 @@ def go_through(page: Page, served: Served) -> None:
     served.thread.join(10.0)
 
 
+@pytest.mark.medium
 def test_a_person_is_led_through_at_every_width(tmp_path: Path) -> None:
     with chromium(tmp_path) as browser:
         for width, height in SIZES:
@@ -84,6 +87,7 @@ def test_a_second_window_watches_and_its_buttons_come_back_with_the_lead(tmp_pat
             see_the_picture(page)
 
 
+@pytest.mark.medium
 def test_the_page_says_when_the_capture_is_gone(tmp_path: Path) -> None:
     with chromium(tmp_path) as browser:
         with played() as served:

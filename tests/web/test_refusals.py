@@ -213,7 +213,8 @@ def test_a_large_body_is_not_read(waiting: Served) -> None:
         b"GET http://evil.example/ HTTP/1.1\r\nHost: evil.example\r\n\r\n",
     ],
 )
-def test_broken_requests_are_refused(waiting: Served, text: bytes) -> None:
+def test_broken_requests_are_refused(waiting: Served, text: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(requests_module, "PATIENCE_S", 0.5)  # one waits for the rest of a line
     assert sent(waiting.port, text)[0] in (0, 400, 403, 414, 431, 505)
     assert waiting.goes_on()
 

@@ -43,6 +43,7 @@ def ellipse(model: Diffraction, geometry: Geometry, place: tuple[float, float]) 
     return np.array([[x, both], [both, y]])
 
 
+@pytest.mark.medium
 def test_the_blur_is_an_ellipse_along_the_radius() -> None:
     scene = small_scene()
     model = start_model(scene.rig, scene.geometry, scene.wire)

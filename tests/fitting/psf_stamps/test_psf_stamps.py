@@ -229,6 +229,7 @@ def test_cores_narrower_than_a_pixel_are_no_hits() -> None:
     assert [o.places for o in result.outliers] == [("stamp 3, +4 px, -3 px from its middle",)]
 
 
+@pytest.mark.medium
 def test_what_the_priors_smooth_is_in_the_error_bars() -> None:
     """A peak of half a pixel has more structure than the dark nodes around it, which set the priors."""
     data = drawn("undersampled", 3, 40, 15, 39460.77060573755, 3.9928840372105223, varies=0.9124181924250762)
@@ -246,6 +247,7 @@ def test_faint_rings_are_within_their_error_bars() -> None:
     assert np.quantile(np.abs(z), 0.999) < 3.9
 
 
+@pytest.mark.medium
 def test_a_field_that_changes_more_than_its_orders_is_told_and_held() -> None:
     data = drawn("coma", 1, count=30, size=15)
     result = fit_psf_stamps(data.stamps, Orders(warp=1, image=1, spacing_px=0.5))

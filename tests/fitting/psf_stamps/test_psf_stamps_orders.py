@@ -74,6 +74,7 @@ def test_a_field_that_does_not_change_needs_one_image_and_no_map() -> None:
     assert np.abs(field.warp).max() < 0.005
 
 
+@pytest.mark.medium
 def test_a_map_alone_needs_one_image_and_a_lobe_that_fades_another() -> None:
     assert [chosen(order, 2) for order in ((2, 0), (0, 1))] == [1, 2]
 
