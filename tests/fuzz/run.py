@@ -20,7 +20,10 @@ from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["udccal"]):
+# Atheris never frees what a comparison of arrays gives. Modules that compare whole pictures read no bytes.
+_OF_PICTURES = ["udccal.restoration.tone", "udccal.fitting.noise.codes", "udccal.fitting.noise.moments"]
+
+with atheris.instrument_imports(include=["udccal"], exclude=_OF_PICTURES):
     from tests.fuzz.targets import TARGETS
 
 _MEMORY_MIB = 2048
