@@ -62,9 +62,8 @@ def test_places_on_the_panel_count_modulo_a_period(measured: Profile) -> None:
     assert found.values[[name for _, name in found.names].index("offset_x_periods")] == pytest.approx(-0.001, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    "term", ["psf", *(pytest.param(term, marks=pytest.mark.medium) for term in ("noise", "geometry", "backscatter"))]
-)
+@pytest.mark.medium
+@pytest.mark.parametrize("term", ["noise", "geometry", "psf", "backscatter"])
 def test_chi2_of_draws_follows_its_degrees_of_freedom(measured: Profile, term: TermName) -> None:
     rng, count, found = np.random.default_rng(3), 150, []
     for _ in range(count):

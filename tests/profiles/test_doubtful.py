@@ -78,6 +78,8 @@ def test_a_term_that_could_not_be_read_again_leaves_the_old_profile(tmp_path: Pa
 def test_a_profile_with_a_warning_has_an_exit_status_of_its_own(tmp_path: Path, well: bool, status: int) -> None:
     program = (
         "from udccal.cli.jobs import fit\n"
+        "from udccal.sessions.store import Session\n"
+        "Session.open = lambda *_: None\n"
         f"fit.fit_to_profile = lambda *_: {well}\n"
         "from udccal.cli.main import main\n"
         f"main(['fit', {str(tmp_path)!r}, '--profile', {str(tmp_path / 'p')!r}])"

@@ -127,7 +127,7 @@ def test_a_reader_beside_a_writer_finds_one_or_the_other(tmp_path: Path, toy_pro
     done = threading.Event()
 
     def replace_often() -> None:
-        for number in range(20):
+        for number in range(40):
             write_profile(tmp_path / "p", profiles[number % 2])
         done.set()
 

@@ -89,6 +89,7 @@ def test_a_frame_that_makes_no_picture_fails_for_who_watches() -> None:
     view.look(frame(seed=1), ())
 
 
+@pytest.mark.medium
 def test_watching_frames_of_the_largest_rig_takes_less_than_a_fifth_of_a_core() -> None:
     frames = [frame(2048, 1536, (700.0 + 9 * seed, 600.0), seed) for seed in range(4)]
     make_picture(frames[0], SAMPLING)

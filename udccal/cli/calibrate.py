@@ -78,19 +78,21 @@ def calibrate(
     log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
-    from udccal.cli.jobs.capture import Wanted
-    from udccal.cli.jobs.fit import fit_to_profile
-    from udccal.io.out_folder import check_writable
-    from udccal.profiles.store import check_replaceable
-    from udccal.rig import load_rig
-    from udccal.sessions.changes import Exchanged
-
     options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed, practice)
     options.check_words({"--yes": yes, "--json-events": json_events, "--web": web})
     if port and not web:
         raise typer.BadParameter("--port is for the page: give --web with it, or leave it out.")
     output: Output = replace(context.obj, events=json_events)
+    from udccal.rig import load_rig
+
     description = load_rig(rig)
+    # What is wrong with the words or the rig is told before the seconds that loading all else takes.
+    from udccal.cli.jobs.capture import Wanted
+    from udccal.cli.jobs.fit import fit_to_profile
+    from udccal.io.out_folder import check_writable
+    from udccal.profiles.store import check_replaceable
+    from udccal.sessions.changes import Exchanged
+
     check_replaceable(profile)
     check_writable(profile.parent)
     wanted = Wanted(

@@ -42,10 +42,10 @@ def check(
     ] = None,
 ) -> None:
     """Check a rig against its profile: ten flats, twenty dark frames and three panel pictures, in three minutes."""
-    from udccal.cli.jobs.check import check_profile
-
     options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed, practice)
     options.check_words({"--yes": yes})
+    from udccal.cli.jobs.check import check_profile
+
     same = check_profile(context.obj, profile, options, yes, out, update)
     if not same:
         raise typer.Exit(STOPPED if same is None else CHANGED)

@@ -21,6 +21,9 @@ def fit(
     log: IterationLog = None,
 ) -> None:
     """Fit all five terms of a captured session, or some of them again, and write a profile with its report."""
+    from udccal.sessions.store import Session
+
+    Session.open(session)  # one that cannot be read is refused before the seconds that loading the fits takes
     from udccal.cli.jobs.fit import fit_to_profile
 
     if not fit_to_profile(context.obj, session, profile, log, [one.value for one in term or ()]):

@@ -332,6 +332,7 @@ def test_dark_frames_that_dark_current_fills_are_left_out() -> None:
     assert np.abs(errors_in_sigma(result, sensor)).max() < 4.5
 
 
+@pytest.mark.medium
 def test_a_dark_current_that_is_left_out_may_be_there_by_its_sigma() -> None:
     """Where it is too weak to be asked for, its sigma is not that of a fit that has it."""
     sensor, lost = replace(PLAIN, dark_e_per_s=0.28), 0
