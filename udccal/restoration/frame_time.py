@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -19,12 +20,12 @@ from jaxtyping import Bool, Float64
 from udccal.cfa import Cfa, cfa_named
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
-from udccal.restoration.clipped import clipped_tiles, completed
+from udccal.restoration.clipped import QUICK, THOROUGH, Effort, clipped_tiles, completed
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.linear import to_electrons, variance_e2
-from udccal.restoration.mosaic_filter import filtered_and_joined, likeliest_strengths
+from udccal.restoration.mosaic_filter import filtered_and_joined
 from udccal.restoration.network import corrected, noise_planes
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -55,7 +56,7 @@ class PartTimes:
         network: of the tier ``accurate``, per pixel that the tiles cover.
         view: resampling and tone, per pixel of the view.
         preview: all of a preview, per pixel of the rows that the view needs.
-        completion: of clipped samples, per pixel of the tiles that have some.
+        completion: of clipped samples, per pixel of the tiles that have some. quick_completion: at the tier fast.
     """
 
     linear: Seconds
@@ -66,6 +67,7 @@ class PartTimes:
     view: Seconds
     preview: Seconds
     completion: Seconds
+    quick_completion: Seconds
 
 
 @final
@@ -107,7 +109,8 @@ class FrameSize:
         seconds = self.strip_px * times.linear + self.view_px * times.view
         if self.tile_px == 0:
             return 1e3 * float(seconds + self.strip_px * times.demosaicing)
-        seconds = seconds + self.tile_px * times.filter + self.clipped_px * times.completion
+        completion = times.quick_completion if tier is Tier.fast else times.completion
+        seconds = seconds + self.tile_px * times.filter + self.clipped_px * completion
         if tier in (Tier.balanced, Tier.accurate):
             seconds = seconds + self.covered_px * times.shrinkage
         if tier is Tier.accurate:
@@ -150,10 +153,14 @@ def _measured(options: PlanOptions) -> PartTimes:
 
     given = unit, tables, layout, cfa, workers
     tiles = layout.cut(signal)
-    clipped = np.broadcast_to(rng.random(tiles.shape[1:]) < _CLIPPED, tiles.shape)
+    clipped = rng.random(tiles.shape[1:]) < _CLIPPED
 
-    def completion() -> None:
-        completed(tiles, clipped, likeliest_strengths(tiles, *given), *given)
+    def completion(effort: Effort) -> None:
+        def one(index: int) -> None:
+            completed(tiles[index], clipped, unit[index], tables.at(index), layout, cfa, effort)
+
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(one, range(layout.count)))
 
     def network() -> None:
         planes = noise_planes(bands, unit, signal, layout)
@@ -167,7 +174,8 @@ def _measured(options: PlanOptions) -> PartTimes:
         (network, mosaic.size),
         (lambda: tone.rgb8(rectification.apply(picture, options.interpolation)), view_x.size),
         (lambda: preview.rgb8(mosaic, 1.0, tone), mosaic.size),
-        (completion, tiles.size),
+        (lambda: completion(THOROUGH), tiles.size),
+        (lambda: completion(QUICK), tiles.size),
     )
     return PartTimes(*(np.array(_least_s(run) / pixels) for run, pixels in parts))
 

@@ -128,23 +128,16 @@ def filtered_and_joined(
     return joined, _filter_each(*given, layout.apart, lambda index, picture: layout.blend(picture, index, joined))
 
 
-def likeliest_strengths(
-    tiles: Tiles,
-    noise_e: Float32[np.ndarray, "tiles 3"],
+def likeliest_strength(
+    tile: Float32[np.ndarray, "*colours rows columns"],
+    noise_e: Float32[np.ndarray, "3"],
     tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
-    workers: int,
-) -> Float32[np.ndarray, " tiles"]:
-    """Return the strength of the prior that each tile chooses. Arguments are those of ``filtered``."""
-
-    def one(index: int) -> np.float32:
-        own = tables.at(index)
-        levels = _levels(tiles[index], pattern)
-        return _chosen(_whitened(tiles[index], levels, noise_e[index], own, layout, pattern), own, layout, pattern)
-
-    with ThreadPoolExecutor(workers) as pool:
-        return np.array(list(pool.map(one, range(len(tiles)))), dtype=np.float32)
+) -> np.float32:
+    """Return the strength of the prior that a tile chooses. Arguments are those of ``filtered``, of one tile."""
+    spectrum = _whitened(tile, _levels(tile, pattern), noise_e, tables, layout, pattern)
+    return _chosen(spectrum, tables, layout, pattern)
 
 
 def _filter_each(
@@ -249,9 +242,15 @@ def _picture(
     by_site = tables.solved(whitened, strength)
     cell, channels = (pattern.rows, pattern.columns), channels_of(pattern)
     matched = tables.matched
-    mixed = np.zeros((len(COLOURS), len(matched), *by_site.shape[1:]), dtype=np.complex64)
-    for site, colour in enumerate(channels):
-        mixed[colour] += matched[:, site] * by_site[site]
+    mixed = np.empty((len(COLOURS), len(matched), *by_site.shape[1:]), dtype=np.complex64)
+    for colour, own in enumerate(mixed):
+        sites = np.flatnonzero(channels == colour)
+        if len(sites) == 0:
+            own[:] = 0
+            continue
+        np.multiply(matched[:, sites[0]], by_site[sites[0]], out=own)
+        for site in sites[1:]:
+            own += matched[:, site] * by_site[site]
     # Colours have much that cancels in their sum. In single precision, they are mixed before they become pictures.
     common = mixed.sum(axis=0)
     common *= np.float32(COMMON)

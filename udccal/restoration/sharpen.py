@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -12,10 +13,10 @@ from jaxtyping import Bool, Float32, Float64, Int
 
 from udccal.cfa import Cfa, cfa_named
 from udccal.restoration.blur import blurred
-from udccal.restoration.clipped import clipped_tiles, completed
+from udccal.restoration.clipped import clipped_tiles, completed, effort_of
 from udccal.restoration.filter_tables import FilterTables, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import filtered_and_joined, likeliest_strengths
+from udccal.restoration.mosaic_filter import filtered_and_joined
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -158,14 +159,18 @@ class Sharpener:
 
     def _filtered(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> _Filtered:
         noise_e = self._tile_noise(variance_e2)
-        tiles = [self.layout.tile(signal_e, index) for index in range(self.layout.count)]
+        tiles = self.layout.tiles(signal_e)
         at, missing = clipped_tiles(clipped, self.layout)
         if len(at):
-            given = noise_e[at], self.tables.at(at), *self._given[1:]
-            own = np.stack([tiles[index] for index in at])
-            whole = completed(own, missing, likeliest_strengths(own, *given), *given)
-            for index, tile in zip(at, whole, strict=True):
-                tiles[index] = tile
+            effort = effort_of(self.tier)
+
+            def whole(index: int, own: Clipped) -> Mosaic:
+                given = noise_e[index], self.tables.at(index), self.layout, self.cfa, effort
+                return completed(tiles[index], own, *given)
+
+            with ThreadPoolExecutor(self.options.workers) as pool:
+                for index, tile in zip(at, pool.map(whole, at.tolist(), missing), strict=True):
+                    tiles[index] = tile
         return _Filtered(tiles, *filtered_and_joined(tiles, noise_e, *self._given), noise_e)
 
     def _sharper(self, found: _Filtered) -> Strip:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import dataclass
-from typing import TypeAlias, final
+from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int, Real
+from jaxtyping import Float32, Int, Real, Shaped
 from scipy import fft
 
 from udccal.errors import RestorationError
@@ -23,8 +23,6 @@ TAPER_PX, BLEND_PX = 24, 16
 LEAST_PX = 2 * (TAPER_PX + BLEND_PX) + 16
 # From a tile's edge to the middle of its blend.
 _OUTSIDE = TAPER_PX + BLEND_PX // 2
-
-_Run: TypeAlias = slice | Int[np.ndarray, " _"]
 
 
 @final
@@ -110,29 +108,42 @@ class TileLayout:
         return slice(self.first_row - self.reach.start, self.last_row - self.reach.start)
 
     def cut(self, strip: Float32[np.ndarray, "strip_rows frame_columns"]) -> Float32[np.ndarray, "tiles rows columns"]:
-        """Return the tiles of a frame's rows ``reach``. At the frame's borders it is mirrored cell by cell."""
-        tiles = np.empty((self.count, self.rows, self.columns), dtype=np.float32)
-        for index, tile in enumerate(tiles):
-            tile[:] = self.tile(strip, index)
-        return tiles
+        """Return copies of the ``tiles`` of a frame's rows ``reach``."""
+        return np.stack(self.tiles(strip))
 
-    def tile(
-        self, strip: Float32[np.ndarray, "strip_rows frame_columns"], index: int
-    ) -> Float32[np.ndarray, "rows columns"]:
-        """Return one tile, as ``cut`` does; a view of the strip where it can be."""
-        down, across = divmod(index, len(self.lefts))
-        return strip[self._runs[0][down]][:, self._runs[1][across]]
+    def tiles(self, strip: Shaped[np.ndarray, "strip_rows frame_columns"]) -> list[Shaped[np.ndarray, "rows columns"]]:
+        """Return the tiles of a frame's rows ``reach``, as views of one copy: at its borders the frame is mirrored.
+
+        Whole cells are mirrored, so that every tile has the same pattern.
+        """
+        rows, columns = self._seen
+        top, left = self.reach.start - self.tops[0], -self.lefts[0]
+        wide = np.empty((len(rows), len(columns)), dtype=strip.dtype)
+        wide[top : top + len(strip), left : left + self.frame_columns] = strip
+        for beyond in (slice(top), slice(top + len(strip), None)):
+            wide[beyond] = wide[rows[beyond] + top]
+        for beyond in (slice(left), slice(left + self.frame_columns, None)):
+            wide[:, beyond] = wide[:, columns[beyond] + left]
+        places = itertools.product((at - self.tops[0] for at in self.tops), (at + left for at in self.lefts))
+        return [wide[y : y + self.rows, x : x + self.columns] for y, x in places]
+
+    @functools.cached_property
+    def _seen(self) -> tuple[Int[np.ndarray, " high"], Int[np.ndarray, " wide"]]:
+        """Rows of the strip, and columns, from the first tile's first to the last tile's last."""
+        rows, columns = (
+            _mirrored(at[:1], at[-1] + size - at[0], most, cell)[0]
+            for at, size, most, cell in (
+                (self.tops, self.rows, self.frame_rows, self.cell_rows),
+                (self.lefts, self.columns, self.frame_columns, self.cell_columns),
+            )
+        )
+        return rows - self.reach.start, columns
 
     @property
     def samples(self) -> tuple[Int[np.ndarray, "tiles_down rows"], Int[np.ndarray, "tiles_across columns"]]:
         """Rows of the strip, and columns, of each row and column of tiles."""
         rows = _mirrored(self.tops, self.rows, self.frame_rows, self.cell_rows) - self.reach.start
         return rows, _mirrored(self.lefts, self.columns, self.frame_columns, self.cell_columns)
-
-    @functools.cached_property
-    def _runs(self) -> tuple[list[_Run], list[_Run]]:
-        rows, columns = self.samples
-        return [_run(each) for each in rows], [_run(each) for each in columns]
 
     @functools.cached_property
     def apart(self) -> list[list[int]]:
@@ -229,11 +240,6 @@ def _mirrored(starts: tuple[int, ...], size: int, most: int, cell: int) -> Int[n
     folded = np.abs((cells + last) % period - last) if last > 0 else np.zeros_like(cells)
     inside = (index >= 0) & (index < most)
     return np.where(inside, index, np.minimum(folded * cell + index % cell, most - 1))
-
-
-def _run(index: Int[np.ndarray, " n"]) -> _Run:
-    """Return consecutive indices as a slice, which needs no copy."""
-    return slice(index[0], index[-1] + 1) if np.all(np.diff(index) == 1) else index
 
 
 def _blended(starts: tuple[int, ...], size: int, first: int, last: int) -> list[Strip]:

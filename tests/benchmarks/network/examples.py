@@ -12,11 +12,11 @@ from scipy import fft
 
 from tests.benchmarks.network.pictures import drawn_picture, photographs
 from udccal.cfa import Cfa, cfa_named
-from udccal.restoration.clipped import completed
+from udccal.restoration.clipped import THOROUGH, completed
 from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
 from udccal.restoration.filter_tables import filter_tables
 from udccal.restoration.kernel_grid import KernelGrid, centred
-from udccal.restoration.mosaic_filter import Pattern, Tables, filtered, filtered_and_joined
+from udccal.restoration.mosaic_filter import Pattern, Tables, filtered_and_joined
 from udccal.restoration.network import details, noise_planes, sharper
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for
@@ -180,8 +180,8 @@ def _clipped(
 ) -> Float32[np.ndarray, "tile tile"]:
     """Clip a tile, and complete it as restoration does."""
     held = np.minimum(tile, np.float32(most_e))
-    _, strength = filtered(held[None], noise_e, *given)
-    return completed(held[None], (tile > most_e)[None], strength, noise_e, *given)[0]
+    tables, layout, pattern, _ = given
+    return completed(held, tile > most_e, noise_e[0], tables.at(0), layout, pattern, THOROUGH)
 
 
 def _lamps(size: int, rng: np.random.Generator) -> Float32[np.ndarray, "size size"]:

@@ -175,8 +175,8 @@ def _by_tiles(deblur: Callable[[Plane, Plane], Plane]) -> Callable[[Restorer, Ta
         kernels = interpolated_kernels(restorer.sharpener.grid, layout.centres_px)
         tiles = np.empty((layout.count, layout.rows, layout.columns, len(planes)), dtype=np.float32)
         for colour, plane in enumerate(planes):
-            for index, kernel in enumerate(kernels[:, colour]):
-                tiles[index, ..., colour] = deblur(layout.tile(plane, index), kernel)
+            for index, (tile, kernel) in enumerate(zip(layout.tiles(plane), kernels[:, colour], strict=True)):
+                tiles[index, ..., colour] = deblur(tile, kernel)
         picture = layout.join(tiles) * np.float32(most / taken.exposure_s)
         return restorer.rectification.from_row(restorer.sharpener.rows.start).apply(picture)
 

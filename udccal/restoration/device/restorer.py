@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, UInt8, UInt16
 from udccal.errors import RestorationError
 from udccal.restoration.backscatter import refuse_excess_of
 from udccal.restoration.checks import check_frame, check_panel_picture
+from udccal.restoration.clipped import effort_of
 from udccal.restoration.device.bands import blurred, refined, shrunk
 from udccal.restoration.device.light import FrontEnd, PanelTables, plausible
 from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
@@ -146,7 +147,7 @@ class DeviceRestorer:
             ),
             device or jax.devices()[0],
         )
-        tiles = TileFilter(*filters, layout, cfa)
+        tiles = TileFilter(*filters, layout, cfa, effort_of(restorer.tier))
         stages = _Stages(FrontEnd(*front, cfa), tiles, bands, learned, maps, options.network_views, error)
         sums = (
             None

@@ -13,7 +13,7 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Complex64, Float, Int
 
 from udccal.cfa import Cfa
-from udccal.restoration.clipped import HALF, LEAST, ROUNDS, STEPS
+from udccal.restoration.clipped import HALF, LEAST, Effort
 from udccal.restoration.device.planes import Mosaic, apart, cut, joined, placing, together
 from udccal.restoration.filter_tables import SPARSE
 from udccal.restoration.mosaic_filter import LEVEL_ROWS, channels_of
@@ -48,6 +48,7 @@ class TileFilter(eqx.Module):
 
     Attributes:
         matched, vectors, values: as in ``FilterTables``. layout: of the tiles. cfa: the colour pattern.
+        effort: how long likelier values of clipped samples are looked for.
     """
 
     matched: Matrix
@@ -55,6 +56,7 @@ class TileFilter(eqx.Module):
     values: Float[Array, "tiles sites y x"]
     layout: TileLayout = eqx.field(static=True)
     cfa: Cfa = eqx.field(static=True)
+    effort: Effort = eqx.field(static=True)
 
     def join(self, pictures: Float[Array, "tiles 3 tile_rows tile_columns"]) -> Float[Array, "3 rows columns"]:
         """Blend the tiles' pictures as ``TileLayout.join`` does."""
@@ -124,11 +126,11 @@ class TileFilter(eqx.Module):
                 return taper * jnp.fft.irfft2(_product(_adjoint(vectors), own), s=least.shape[1:])
 
             def likelier(value: Planes, free: Bool[Array, "sites _ _"]) -> Planes:
-                change, _ = cg(lambda of: free * precision(of), -precision(value) * free, maxiter=STEPS)
+                change, _ = cg(lambda of: free * precision(of), -precision(value) * free, maxiter=self.effort.steps)
                 return jnp.where(missing, jnp.maximum(value + change, least), least)
 
             value = likelier(least, missing)
-            for _ in range(1, ROUNDS):
+            for _ in range(1, self.effort.rounds):
                 value = likelier(value, missing & (value > least))
             return value
 
