@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from tests.fitting.psf_stamps.test_psf_stamps import READ_E, make
+from tests.scenes.stamps import drawn as whole
 from udccal.fitting.psf_stamps.data import StampsRules
 from udccal.fitting.psf_stamps.field import Changes
-from udccal.fitting.psf_stamps.model_error import _larger, drawn
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.model_error import _larger, _surely_off, drawn
 from udccal.fitting.psf_stamps.probability import faintest
 from udccal.fitting.psf_stamps.search import start
 from udccal.numerics import in_float64
+from udccal.result import FitStatus
 
 
 def test_the_noise_of_all_stars_together_is_also_that_of_the_background() -> None:
@@ -32,6 +35,26 @@ def test_an_error_of_a_few_stars_counts() -> None:
     for error in (few, every):
         found = _larger((noise + error) ** 2, variance)
         assert found == pytest.approx((error**2).mean(), rel=0.25)
+
+
+def test_stars_left_out_are_off_by_no_more_than_is_sure() -> None:
+    rng, shape = np.random.default_rng(4), (20, 225)
+    light = 1e5 * np.exp(-np.linspace(0.0, 15.0, 225)) * np.ones(shape)
+    variance, used = light + 25.0, np.ones(shape, dtype=bool)
+    noise = np.sqrt(variance) * rng.standard_normal(shape)
+    assert _surely_off(noise**2, variance, light, used) < 0.002
+    off = noise + np.where(np.arange(20) < 3, 0.1, 0.0)[:, None] * light
+    assert 0.03 < _surely_off(off**2, variance, light, used) < 0.1 * np.sqrt(3 / 20)
+    assert _surely_off(off**2, variance, light, ~used) == 0.0
+
+
+@pytest.mark.medium
+def test_positions_that_are_exchanged_are_told() -> None:
+    stamps = whole("undersampled", 2, 20, 15, 2.5e5, 4.0, (0.0, 0.0), varies=1.0).stamps
+    assert fit_psf_stamps(stamps).status is FitStatus.CONVERGED
+    exchanged = fit_psf_stamps(replace(stamps, position_px=np.roll(stamps.position_px, 7, axis=0)))
+    assert exchanged.status is FitStatus.POOR_FIT
+    assert "has its own position" in exchanged.notes[0]
 
 
 @in_float64

@@ -253,6 +253,11 @@ def _report(
     status, note = bad or (FitStatus.CONVERGED, "")
     if not bad and max(chi2_dof, _faint_scatter(stamps, state)) > rules.poor_above:
         status, note = FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
+    elif not bad and state.left_out_off > rules.left_out_above * size:
+        found_off = (
+            f"Stamps that were left out are off by {100 * state.left_out_off:.2g} %, {100 * size:.2g} % expected."
+        )
+        status, note = FitStatus.POOR_FIT, f"{found_off} Check that each stamp has its own position."
     elif not bad and not found.converged:
         left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
         status, note = FitStatus.NOT_CONVERGED, left
@@ -272,6 +277,7 @@ def _report(
             Diagnostic("samples_beyond_the_image", float((stamps.known & state.keep).sum() - z.size), "1"),
             Diagnostic("sigma_inflation", inflation, "1"),
             Diagnostic("model_error", state.misfit, "1"),
+            Diagnostic("left_out_off", state.left_out_off, "1"),
             Diagnostic("background", float(state.background_e.mean()), "e-"),
         ),
         notes=(*([note] if note else []), *_told(state)),

@@ -41,15 +41,15 @@ def of_residuals(stamps: Stamps, state: State) -> Nodes:
     return _shown(stamps, state, seen.residual**2, variance, 1.0, _typical)
 
 
-def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> Nodes:
-    """Return the model error that stars show which are left out of a fit, a part at a time.
+def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> tuple[Nodes, float]:
+    """Return the model error that stars show which are left out of a fit, a part at a time, and how far they are off.
 
     Their squares are compared with noise and the uncertainty of the others' field, both less what a star's own place
-    and light take up. Zeros where these explain the squares.
+    and light take up. The model error is zero where these explain the squares; the second number is ``_surely_off``.
     """
     rng = np.random.default_rng(0)
     part = rng.permutation(len(stamps.unit)) % rules.parts
-    square, variance = np.zeros((2, *stamps.known.shape))
+    square, variance, light = np.zeros((3, *stamps.known.shape))
     for own in range(rules.parts):
         out = part == own
         found = laplace(stamps, replace(state, keep=state.keep & ~out[:, None]))
@@ -63,8 +63,33 @@ def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> Nodes
         change -= taken @ (taken.transpose(0, 2, 1) @ change)
         every = 1.0 - (taken**2).sum(axis=2) + (change**2).mean(axis=2)
         square[out] = (seen.residual**2)[out]
+        light[out] = (seen.mean_e - np.take_along_axis(there.background_e, stamps.plane, axis=1))[out]
         np.divide(every, seen.weight, out=variance, where=(seen.weight > 0) & out[:, None])
-    return _shown(stamps, state, square, variance, SIGNIFICANT, _larger)
+    shown = _shown(stamps, state, square, variance, SIGNIFICANT, _larger)
+    return shown, _surely_off(square, variance, light, (variance > 0) & ~stamps.clipped)
+
+
+def _surely_off(
+    square: Float[np.ndarray, "stars samples"],
+    variance: Float[np.ndarray, "stars samples"],
+    light: Float[np.ndarray, "stars samples"],
+    used: Bool[np.ndarray, "stars samples"],
+) -> float:
+    """Return the least error of stars that were left out, relative to their L2 norm, by three sigma of its scatter.
+
+    Root mean square over stars, whatever their place: in the model error, stars for which the others extrapolate have
+    little weight.
+    """
+    excess, scatter, norm = (
+        np.where(used, each, 0.0).sum(axis=1) for each in (square - variance, variance**2, light**2)
+    )
+    seen = norm > 0
+    if not seen.any():
+        return 0.0
+    ratio, spread = excess[seen] / norm[seen], 2 * scatter[seen] / norm[seen] ** 2
+    weight = 1.0 / (spread + np.median(spread))
+    least = np.average(ratio, weights=weight) - 3 * np.sqrt((weight**2 * spread).sum()) / weight.sum()
+    return float(np.sqrt(max(least, 0.0)))
 
 
 def placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> State:

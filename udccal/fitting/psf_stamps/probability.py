@@ -78,6 +78,7 @@ class State:
         keep: True for samples that are not outliers.
         model_error: what the model does not describe, in light per pixel at the nodes, which adds to the noise.
         margin: of the nodes' grid, where images other than the first are zero.
+        left_out_off: least relative error of stars that were left out of the fit.
     """
 
     field: PsfField
@@ -89,6 +90,7 @@ class State:
     keep: Bool[np.ndarray, "stars samples"]
     model_error: Float[np.ndarray, "planes grid_rows grid_columns"]
     margin: int = 0
+    left_out_off: float = 0.0
 
     @property
     def name(self) -> str:
