@@ -130,14 +130,8 @@ def _first_bias(line: Line) -> str:
     return f"{100 * bias[0]:.2g}" if bias and bias[0] is not None else _NONE
 
 
-def tables(lines: list[Line]) -> str:
-    """A Markdown table per work, ours first."""
-    return "\n\n".join(
-        f"### {work}\n\n{_table(work, lines)}" for work in _COLUMNS if any(x.work == work for x in lines)
-    )
-
-
-def _table(work: str, lines: list[Line]) -> str:
+def table(work: str, lines: list[Line]) -> str:
+    """A Markdown table of the lines of a work."""
     columns = (*_COLUMNS[work], *_SECONDS)
     head = ["", *(title for title, _ in columns)]
     rules = ["---", *["---:"] * len(columns)]

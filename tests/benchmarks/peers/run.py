@@ -1,4 +1,4 @@
-"""`make peers`: udccal and its peers on the same works with known truth, in one run. Puts the table into docs/peers.md.
+"""`make peers`: udccal and its peers on the same works with known truth. Puts a table of each work into docs/peers.md.
 
 The peers run in environments of their own, made by the works' setup.sh; one after another, since timings side by side
 are worthless. A peer that cannot run here is a line that says why.
@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from tests.benchmarks.commit import this_commit
-from tests.benchmarks.peers.lines import Line, tables
+from tests.benchmarks.peers.lines import Line, table
 from tests.benchmarks.readme_tables import put_table
 
 _ROOT = Path(__file__).resolve().parents[3]
@@ -68,7 +68,7 @@ OURS = {
 
 
 def main() -> None:
-    """Run ours and theirs; the results stay in a JSON-lines file, from which the table is made."""
+    """Run ours and theirs; the results stay in a JSON-lines file, from which the tables are made."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("works", nargs="*", default=[], choices=[[], *OURS], metavar="work")
     parser.add_argument("--peers", type=Path, default=_ROOT.parent / "shared" / "peers", help="folder of works.py")
@@ -80,7 +80,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     environment = environment_for(options.environments)
     if not options.ours_only:
-        _set_up(options.peers, environment)
+        _set_up(works, options.peers, environment)
     results = options.out / "results.jsonl"
     kept = [line for line in _read(results) if not _measured_again(line, works, options.ours_only)]
     for work in works:
@@ -91,8 +91,9 @@ def main() -> None:
             if peer.work == work:
                 kept += run_peer(peer, python_of(peer.environment, options.environments), options.peers, environment)
         results.write_text("".join(line.text() + "\n" for line in kept), encoding="utf-8")
-    stamp = f"Measured {datetime.now(UTC):%Y-%m-%d}, all in one run." if not options.ours_only else ""
-    put_table(_PAGE, "peers", f"{stamp}\n\n{tables(kept)}", {line.commit for line in kept})
+        stamp = f"Measured {datetime.now(UTC):%Y-%m-%d}, all in one run." if not options.ours_only else ""
+        own = [line for line in kept if line.work == work]
+        put_table(_PAGE, f"peers {work}", f"{stamp}\n\n{table(work, own)}", {line.commit for line in own})
 
 
 def environment_for(environments: Path) -> dict[str, str]:
@@ -127,9 +128,9 @@ def run_peer(peer: Peer, python: str, peers: Path, environment: dict[str, str]) 
     return _run(peer.work, peer.script, [python, *peer.script.split()], peers, environment)
 
 
-def _set_up(peers: Path, environment: dict[str, str]) -> None:
-    """Those of setup.sh's environments that the peers here need; each of its lines ``mk NAME ...`` makes one."""
-    needed = {peer.environment for peer in PEERS}
+def _set_up(works: tuple[str, ...], peers: Path, environment: dict[str, str]) -> None:
+    """Those of setup.sh's environments that the works' peers need; each of its lines ``mk NAME ...`` makes one."""
+    needed = {peer.environment for peer in PEERS if peer.work in works}
     script = "\n".join(
         line
         for line in (peers / "setup.sh").read_text(encoding="utf-8").splitlines()

@@ -250,17 +250,7 @@ def _report(
     warp = state.field.warp
     cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(warp.size))
     cov, names = block_diag(spread**2, cov), ["kernel_relative_l2", *_names(state)]
-    status, note = bad or (FitStatus.CONVERGED, "")
-    if not bad and max(chi2_dof, _faint_scatter(stamps, state)) > rules.poor_above:
-        status, note = FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
-    elif not bad and state.left_out_off > rules.left_out_above * size:
-        found_off = (
-            f"Stamps that were left out are off by {100 * state.left_out_off:.2g} %, {100 * size:.2g} % expected."
-        )
-        status, note = FitStatus.POOR_FIT, f"{found_off} Check that each stamp has its own position."
-    elif not bad and not found.converged:
-        left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
-        status, note = FitStatus.NOT_CONVERGED, left
+    status, note = bad or _verdict(stamps, found, chi2_dof, float(size), rules)
     return FitResult(
         name="psf",
         term=term,
@@ -285,6 +275,20 @@ def _report(
         residuals=residual_sample((term.star_px[:, None] + stamps.offset_px)[used], z),
         posterior=Posterior(np.zeros(len(term.factor)), term.factor, term.changed),
     )
+
+
+def _verdict(stamps: Stamps, found: Found, chi2_dof: float, size: float, rules: StampsRules) -> tuple[FitStatus, str]:
+    """Return the status, and what to do where it is a bad one; ``size`` is the expected relative error of kernels."""
+    off = found.place.left_out_off
+    if max(chi2_dof, _faint_scatter(stamps, found.place)) > rules.poor_above:
+        return FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
+    if off > rules.left_out_above * size:
+        told = f"Stamps that were left out are off by {100 * off:.2g} %, where {100 * size:.2g} % are expected."
+        return FitStatus.POOR_FIT, f"{told} Check that each stamp has its own position."
+    if not found.converged:
+        left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
+        return FitStatus.NOT_CONVERGED, left
+    return FitStatus.CONVERGED, ""
 
 
 def _faint_scatter(stamps: Stamps, state: State) -> float:
