@@ -143,8 +143,8 @@ class StampsRules:
         parts: of the stars, of which one at a time is left out to see the errors of the others' field.
         inflate_above: reduced chi-squared above which every sigma grows with its root. Counts are skewed, so that
             their chi-squared scatters more than that of normal samples.
-        poor_above: reduced chi-squared above which the fit is poor.
-        left_out_above: error of stars that were left out, in units of the expected one, above which the fit is poor.
+        poor_above: reduced chi-squared above which the fit is poor; likewise squared errors of stars that were left
+            out, in units of the expected ones.
     """
 
     least_snr: float = 10.0
@@ -176,7 +176,6 @@ class StampsRules:
     parts: int = 4
     inflate_above: float = 1.05
     poor_above: float = 2.0
-    left_out_above: float = 1.0
 
 
 def mosaic_channels(

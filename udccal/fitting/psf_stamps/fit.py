@@ -282,7 +282,7 @@ def _verdict(stamps: Stamps, found: Found, chi2_dof: float, size: float, rules: 
     off = found.place.left_out_off
     if max(chi2_dof, _faint_scatter(stamps, found.place)) > rules.poor_above:
         return FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
-    if off > rules.left_out_above * size:
+    if off**2 > rules.poor_above * size**2:
         told = f"Stamps that were left out are off by {100 * off:.2g} %, where {100 * size:.2g} % are expected."
         return FitStatus.POOR_FIT, f"{told} Check that each stamp has its own position."
     if not found.converged:
