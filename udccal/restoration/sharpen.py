@@ -190,7 +190,7 @@ class Sharpener:
         rest = np.zeros_like(signal_e)
         rest[inner] = signal_e[inner] - np.take_along_axis(expected, channels[..., None], axis=2)[..., 0]
         rest[clipped] = np.maximum(rest[clipped], 0.0)
-        return filtered_and_joined(self.layout.cut(rest), noise_e, *self._given)[0]
+        return filtered_and_joined(self.layout.tiles(rest), noise_e, *self._given)[0]
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
         """Return the sigma of a sample of each colour in each tile."""
