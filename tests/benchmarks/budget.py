@@ -48,7 +48,7 @@ from udccal.simulation.wire import wire_map
 from udccal.tiers import Tier
 
 _PAGE = Path(__file__).resolve().parents[2] / "docs" / "restoration.md"
-_WORKERS, _TILE = 2, 256
+_WORKERS, _TILE = 2, PlanOptions.tile_rows
 # Samples from the borders that are not judged, but in the row of the borders.
 _INNER = 64
 

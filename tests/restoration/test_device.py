@@ -62,7 +62,7 @@ def restorers(small_rig: RigDescription, toy_noise: Noise, toy_grid: KernelGrid)
     panel, geometry, found = panel_light(rig), nominal_geometry(rig), {}
     white = panel.rate(np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8))
     for tier in TIERS:
-        whole = made(tier, rig, toy_noise, geometry, toy_grid)
+        whole = made(tier, rig, toy_noise, geometry, toy_grid, needed_alone=True)
         rows = whole.rows
         assert rows.start > 0
         mask, wire = PanelMask(white[rows], panel.cfa, 0.02), whole.wire[rows]

@@ -357,7 +357,7 @@ def test_other_tiles_share_the_kernels(
 ) -> None:
     _refuse(monkeypatch, "kernel_grid", "filter_tables")
     with pytest.raises(pytest.fail.Exception, match="filter_tables"):
-        Restorer.from_profile(profile, Tier.fast, replace(_OPTIONS, tile_columns=104), filled[0])
+        Restorer.from_profile(profile, Tier.fast, replace(_OPTIONS, tile_columns=144), filled[0])
 
 
 def test_a_rig_of_another_name_shares_all(

@@ -22,7 +22,9 @@ from udccal.tiers import Tier
 
 EXPOSURE_S = 0.01
 ROWS, COLUMNS = 96, 128
-OPTIONS = PlanOptions(tile_rows=128, tile_columns=128, workers=1)
+OPTIONS = PlanOptions(tile_rows=120, tile_columns=96, workers=1)
+# A tile that begins to be used in this row reaches to the first one.
+REACHED_PX = 20
 NOISE = Noise(0.355, 64.0, 3969.0, 5.0, 0.1, 0.2, 1.0, 20.0, 2.0, 0.005)
 
 
@@ -71,12 +73,22 @@ def scene() -> np.ndarray:
     return (6000.0 * picture).astype(np.float32)
 
 
-def made(tier: Tier, rig: RigDescription, noise: Noise, geometry: Geometry, grid: KernelGrid) -> Restorer:
+def made(
+    tier: Tier,
+    rig: RigDescription,
+    noise: Noise,
+    geometry: Geometry,
+    grid: KernelGrid,
+    needed_alone: bool = False,
+) -> Restorer:
+    """The restorer of rows that the view needs, and of so many above that tiles reach all: a test's wire is of all."""
     camera = rig.camera
     view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
     rectification = Rectification.of(geometry, view)
     y = np.mgrid[: camera.rows, : camera.columns][0]
-    sharpener = Sharpener.of(grid, rig, rectification.rows, tier, OPTIONS)
+    first, last = rectification.rows
+    rows = first if needed_alone else min(first, REACHED_PX), last
+    sharpener = Sharpener.of(grid, rig, rows, tier, OPTIONS)
     return Restorer(
         tier=tier,
         rig=rig,

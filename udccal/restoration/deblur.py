@@ -24,7 +24,7 @@ from udccal.restoration.mosaic_filter import filtered_and_joined
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.shrink import measured_noise, shrunk
-from udccal.restoration.tiles import TileLayout, layout_for
+from udccal.restoration.tiles import GENERAL, TileLayout, layout_for
 from udccal.tiers import Tier, tier_named
 
 # Second differences: the finest detail along one axis.
@@ -81,7 +81,7 @@ def deblur(
     unit = float(np.max(np.abs(picture), initial=0.0)) or 1.0
     light = np.ascontiguousarray(picture / unit, dtype=np.float32)
     rows, columns = light.shape[:2]
-    layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows))
+    layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows), GENERAL)
     tiles = _cut(light, layout)
     read, slope = _noise_line(tiles, _finest(rows, columns))
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), _LEAST_VARIANCE)).astype(np.float32)

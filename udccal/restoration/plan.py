@@ -54,7 +54,7 @@ class PlanOptions:
     grid_rows: int = 7
     grid_columns: int = 9
     tile_rows: int = 256
-    tile_columns: int = 256
+    tile_columns: int = 224
     interpolation: Interpolation = Interpolation.CUBIC
     network_views: int = 4
     workers: int = 2

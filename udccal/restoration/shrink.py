@@ -20,7 +20,7 @@ from scipy import sparse
 
 from udccal.restoration.mosaic_filter import Pattern, Tables, filtered
 from udccal.restoration.scene_prior import STRENGTHS
-from udccal.restoration.tiles import BLEND_PX, TAPER_PX, Strip, TileLayout
+from udccal.restoration.tiles import Strip, TileLayout
 
 LEVELS, BANDS = 4, 3
 # A sample keeps 1 - margin * noise / energy: the energy of noise alone scatters about its mean.
@@ -87,9 +87,9 @@ def measured_noise(
     tiles = np.repeat(noise, len(strengths), axis=0)
     unit = np.ones((len(tiles), 3), dtype=np.float32)
     pictures, _ = filtered(tiles, unit, tables.at(repeated), layout, pattern, workers, np.tile(strengths, len(chosen)))
-    inner = slice(TAPER_PX + BLEND_PX, -TAPER_PX - BLEND_PX)
+    whole = tuple(slice(ends.both, -ends.both) for ends in (layout.down, layout.across))
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(lambda picture: _band_variances(picture[inner, inner]), pictures))
+        parts = list(pool.map(lambda picture: _band_variances(picture[whole]), pictures))
     variance = np.zeros((len(chosen), len(STRENGTHS), 3, LEVELS, BANDS), dtype=np.float32)
     variance[:, np.searchsorted(STRENGTHS, strengths)] = np.stack(parts).reshape(len(chosen), -1, 3, LEVELS, BANDS)
     return BandNoise(variance, probe.reshape(-1))

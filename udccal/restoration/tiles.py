@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import dataclass
-from typing import final
+from typing import Final, final
 
 import cv2
 import numpy as np
@@ -18,11 +18,39 @@ from scipy import fft
 
 from udccal.errors import RestorationError
 
-TAPER_PX, BLEND_PX = 24, 16
 # A tile's part that is neither tapered nor blended must hold the bands of its noise.
-LEAST_PX = 2 * (TAPER_PX + BLEND_PX) + 16
-# From a tile's edge to the middle of its blend.
-_OUTSIDE = TAPER_PX + BLEND_PX // 2
+_LEAST_WHOLE_PX: Final = 16
+
+
+@final
+@dataclass(frozen=True)
+class Margins:
+    """Ends of a tile along one axis, in px.
+
+    Attributes:
+        taper: samples that fade out towards the end; nothing of them is used.
+        blend: samples next to these, in which neighbouring tiles are blended.
+    """
+
+    taper: int
+    blend: int
+
+    @property
+    def outside(self) -> int:
+        """From a tile's end to the middle of its blend."""
+        return self.taper + self.blend // 2
+
+    @property
+    def both(self) -> int:
+        """From a tile's end to what is neither tapered nor blended."""
+        return self.taper + self.blend
+
+
+# Down and across. Most of what a display's pixel rows blur lies within a few px, and less of it across than down.
+BEHIND_A_DISPLAY: Final = Margins(20, 8), Margins(12, 12)
+# Of kernels of any kind.
+GENERAL: Final = Margins(24, 16), Margins(24, 16)
+LEAST_PX: Final = 2 * max(each.both for each in (*BEHIND_A_DISPLAY, *GENERAL)) + _LEAST_WHOLE_PX
 
 
 @final
@@ -53,6 +81,7 @@ class TileLayout:
         first_row, last_row: rows of the frame that are covered, the last one excluded. frame_rows: the frame's rows.
         frame_columns: the frame's columns; all are covered.
         cell_rows, cell_columns: the colour pattern's cell; every tile starts at the beginning of one.
+        down, across: ends of a tile.
     """
 
     rows: int
@@ -63,16 +92,18 @@ class TileLayout:
     frame_columns: int
     cell_rows: int
     cell_columns: int
+    down: Margins = BEHIND_A_DISPLAY[0]
+    across: Margins = BEHIND_A_DISPLAY[1]
 
     @functools.cached_property
     def tops(self) -> tuple[int, ...]:
         """First row of each row of tiles; it may lie outside the frame."""
-        return _starts(self.first_row, self.last_row, self.rows, self.cell_rows)
+        return _starts(self.first_row, self.last_row, self.rows, self.cell_rows, self.down)
 
     @functools.cached_property
     def lefts(self) -> tuple[int, ...]:
         """First column of each column of tiles; it may lie outside the frame."""
-        return _starts(0, self.frame_columns, self.columns, self.cell_columns)
+        return _starts(0, self.frame_columns, self.columns, self.cell_columns, self.across)
 
     @property
     def count(self) -> int:
@@ -90,7 +121,7 @@ class TileLayout:
     @functools.cached_property
     def taper(self) -> Float32[np.ndarray, "rows columns"]:
         """Weights of a tile's samples before the transform."""
-        return _ramped(self.rows, 0, TAPER_PX)[:, None] * _ramped(self.columns, 0, TAPER_PX)
+        return _ramped(self.rows, 0, self.down.taper)[:, None] * _ramped(self.columns, 0, self.across.taper)
 
     @functools.cached_property
     def power(self) -> float:
@@ -181,8 +212,8 @@ class TileLayout:
     def strips(self) -> tuple[list[Strip], list[Strip]]:
         """The tiles along both axes of the joined picture."""
         return (
-            _blended(self.tops, self.rows, self.first_row, self.last_row),
-            _blended(self.lefts, self.columns, 0, self.frame_columns),
+            _blended(self.tops, self.rows, self.first_row, self.last_row, self.down),
+            _blended(self.lefts, self.columns, 0, self.frame_columns, self.across),
         )
 
     def by_place(self, values: Real[np.ndarray, "tiles *k"]) -> Real[np.ndarray, "tiles_down tiles_across *k"]:
@@ -191,7 +222,12 @@ class TileLayout:
 
 
 def layout_for(
-    frame_rows: int, frame_columns: int, cell: tuple[int, int], largest: tuple[int, int], rows: tuple[int, int]
+    frame_rows: int,
+    frame_columns: int,
+    cell: tuple[int, int],
+    largest: tuple[int, int],
+    rows: tuple[int, int],
+    margins: tuple[Margins, Margins] = BEHIND_A_DISPLAY,
 ) -> TileLayout:
     """Return the tiles that cover the ``rows`` (first, past the last) of a frame: as few as possible, then as small.
 
@@ -200,6 +236,7 @@ def layout_for(
         cell: (rows, columns) of the colour pattern.
         largest: (rows, columns) of a tile at most, rounded up to whole cells.
         rows: first row to be covered, and the row after the last one.
+        margins: ends of a tile, down and across.
 
     Raises:
         RestorationError: when a tile is too small to have a part that is neither tapered nor blended.
@@ -210,24 +247,24 @@ def layout_for(
             "Give larger ones."
         )
     first, last = max(rows[0], 0), min(rows[1], frame_rows)
-    height = _fitted(last - first, largest[0], cell[0])
-    return TileLayout(
-        height, _fitted(frame_columns, largest[1], cell[1]), first, last, frame_rows, frame_columns, *cell
-    )
+    down, across = margins
+    height = _fitted(last - first, largest[0], cell[0], down)
+    width = _fitted(frame_columns, largest[1], cell[1], across)
+    return TileLayout(height, width, first, last, frame_rows, frame_columns, *cell, down, across)
 
 
-def _fitted(span: int, largest: int, cell: int) -> int:
+def _fitted(span: int, largest: int, cell: int, ends: Margins) -> int:
     """Return the smallest size of tiles, of whole cells and with a fast transform, that needs no more tiles."""
     most = -(-largest // cell) * cell
-    count = -(-(span + cell) // (most - 2 * _OUTSIDE))
-    needed = max(-(-(span + cell) // count) + 2 * _OUTSIDE, LEAST_PX)
+    count = -(-(span + cell) // (most - 2 * ends.outside))
+    needed = max(-(-(span + cell) // count) + 2 * ends.outside, LEAST_PX)
     return min(most, cell * int(fft.next_fast_len(-(-needed // cell), real=True)))
 
 
-def _starts(first: int, last: int, size: int, cell: int) -> tuple[int, ...]:
+def _starts(first: int, last: int, size: int, cell: int, ends: Margins) -> tuple[int, ...]:
     """Return where tiles start so that their inner parts cover [first, last), a constant step apart."""
-    step = (size - 2 * _OUTSIDE) // cell * cell
-    start = -(-(first - _OUTSIDE - cell + 1) // cell) * cell
+    step = (size - 2 * ends.outside) // cell * cell
+    start = -(-(first - ends.outside - cell + 1) // cell) * cell
     count = max(1, -(-(last - first + cell) // step))
     return tuple(start + step * index for index in range(count))
 
@@ -242,12 +279,12 @@ def _mirrored(starts: tuple[int, ...], size: int, most: int, cell: int) -> Int[n
     return np.where(inside, index, np.minimum(folded * cell + index % cell, most - 1))
 
 
-def _blended(starts: tuple[int, ...], size: int, first: int, last: int) -> list[Strip]:
+def _blended(starts: tuple[int, ...], size: int, first: int, last: int, ends: Margins) -> list[Strip]:
     """Return the strips of [first, last) along one axis."""
-    ramp, total = _ramped(size, TAPER_PX, BLEND_PX), np.zeros(last - first, dtype=np.float32)
+    ramp, total = _ramped(size, ends.taper, ends.blend), np.zeros(last - first, dtype=np.float32)
     places = []
     for start in starts:
-        part = slice(max(TAPER_PX, first - start), max(min(size - TAPER_PX, last - start), TAPER_PX))
+        part = slice(max(ends.taper, first - start), max(min(size - ends.taper, last - start), ends.taper))
         at = slice(start + part.start - first, start + part.stop - first)
         total[at] += ramp[part]
         places.append((part, at))

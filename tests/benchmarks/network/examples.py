@@ -19,7 +19,7 @@ from udccal.restoration.kernel_grid import KernelGrid, centred
 from udccal.restoration.mosaic_filter import Pattern, Tables, filtered_and_joined
 from udccal.restoration.network import details, noise_planes, sharper
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
-from udccal.restoration.tiles import TileLayout, layout_for
+from udccal.restoration.tiles import GENERAL, TileLayout, layout_for
 from udccal.rig import load_rig
 from udccal.simulation.psf import captured_light
 from udccal.simulation.truth import draw_truth
@@ -57,7 +57,7 @@ class Optics:
     def of(cls, kernels: Float32[np.ndarray, "3 rows columns"], turn: int) -> Optics:
         """Prepare the filter of one tile, for the next pattern in turn."""
         pattern = _PATTERNS[turn % len(_PATTERNS)]
-        layout = layout_for(_USED_PX, _USED_PX, (2, 2), (_TILE_PX, _TILE_PX), (0, _USED_PX))
+        layout = layout_for(_USED_PX, _USED_PX, (2, 2), (_TILE_PX, _TILE_PX), (0, _USED_PX), GENERAL)
         grid = KernelGrid(np.zeros(1), np.zeros(1), kernels[None, None])
         whole = pattern is THREE_COLOURS
         tables = colour_tables(grid, layout, 1) if whole else filter_tables(grid, layout, pattern, 1)

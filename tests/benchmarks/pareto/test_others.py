@@ -67,7 +67,12 @@ def test_a_library_that_returns_what_it_is_given_has_it_in_its_place(tmp_path: P
     rig = toy.model_copy(update={"camera": toy.camera.model_copy(update={"rows": rows}), "view": wide})
     middle = np.array([geometry.principal_point_px[0], rows / 2])
     tall = made(
-        Tier.fast, rig, NOISE, Geometry(**{**vars(geometry), "principal_point_px": middle}), toy_restorer.grid()
+        Tier.fast,
+        rig,
+        NOISE,
+        Geometry(**{**vars(geometry), "principal_point_px": middle}),
+        toy_restorer.grid(),
+        needed_alone=True,
     )
     assert tall.sharpener is not None
     assert 0 < tall.sharpener.rows.start != tall.rows.start
