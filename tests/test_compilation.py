@@ -3,12 +3,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
+from udccal.cli.jobs.rigs import new_rig
+from udccal.cli.output import Output
 from udccal.compilation import FOLDER_VARIABLE, compilation_clock, compilation_folder
-from udccal.rig_folders import user_rig_folder
+from udccal.errors import RigError
+from udccal.rig_folders import find_rig, user_rig_folder
 
 # Compiles something large and something small: both are worth keeping.
 _PROGRAM = """
@@ -72,12 +76,28 @@ def test_there_is_one_clock() -> None:
     assert compilation_clock() is compilation_clock()
 
 
-def test_a_user_without_a_home_folder_names_another(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def no_home() -> Path:
+@pytest.fixture
+def no_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
-    monkeypatch.setattr(Path, "home", no_home)
+    monkeypatch.setattr(Path, "home", absent)
+    for name in (FOLDER_VARIABLE, "XDG_CACHE_HOME", "UDCCAL_RIGS"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.mark.usefixtures("no_home")
+def test_a_user_without_a_home_folder_names_another(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     monkeypatch.setenv("UDCCAL_RIGS", str(tmp_path / "rigs"))
     assert compilation_folder().parent == tmp_path
     assert user_rig_folder() == tmp_path / "rigs"
+
+
+@pytest.mark.usefixtures("no_home")
+def test_a_user_without_a_home_folder_has_the_shipped_rigs_and_a_cache() -> None:
+    assert user_rig_folder() is None
+    assert find_rig("lg55-reduced").is_dir()
+    assert compilation_folder().is_relative_to(tempfile.gettempdir())
+    with pytest.raises(RigError, match="UDCCAL_RIGS"):
+        new_rig(Output(), "mine", "lg55-reduced")

@@ -6,11 +6,14 @@ import functools
 import hashlib
 import os
 import platform
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
 import jax
+
+from udccal.io.home import home_folder
 
 FOLDER_VARIABLE = "UDCCAL_COMPILATIONS"
 _MOST_BYTES = 512 * 2**20
@@ -27,10 +30,15 @@ def compilation_folder() -> Path:
 
     A home folder may be shared by machines of different processors; code made for one may not run on another.
     """
-    # A user without a home folder can name another.
     given, cache = os.environ.get(FOLDER_VARIABLE), os.environ.get("XDG_CACHE_HOME")
-    base = Path(given) if given else Path(cache or Path.home() / ".cache") / "udccal" / "compilations"
+    base = Path(given) if given else (Path(cache) if cache else _cache_folder()) / "udccal" / "compilations"
     return base / f"{platform.machine()}-{hashlib.sha256(_processor()).hexdigest()[:12]}"
+
+
+def _cache_folder() -> Path:
+    """Return the user's own, below home; a user without a home has one beside others' temporary files."""
+    home = home_folder()
+    return Path(tempfile.gettempdir()) / f"cache-{os.getuid()}" if home is None else home / ".cache"
 
 
 def _processor() -> bytes:
@@ -63,7 +71,9 @@ def private_folder(folder: Path) -> bool:
     """Make a folder, and return whether its owner alone may write to it: what is read from it is run, or trusted."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        return folder.stat().st_mode & 0o022 == 0 and os.access(folder, os.W_OK)
+        status = folder.stat()
+        own = os.name != "posix" or status.st_uid == os.geteuid()
+        return own and status.st_mode & 0o022 == 0 and os.access(folder, os.W_OK)
     except OSError:
         return False
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import enum
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Literal, Protocol, TypeVar, final, runtime_checkable
@@ -59,7 +60,7 @@ class Estimate:
     @property
     def by_prior(self) -> bool:
         """Whether the prior decides: at least half of what is known of the quantity is the prior."""
-        return self.prior is not None and self.sigma**2 >= self.prior.sigma**2 / 2
+        return self.prior is not None and self.sigma >= self.prior.sigma * math.sqrt(0.5)
 
 
 @dataclass(frozen=True)

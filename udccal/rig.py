@@ -22,6 +22,8 @@ RIG_NAME = r"^[a-z0-9][a-z0-9._-]{0,63}$"
 _SUBJECT = re.compile(r"^(Input|String)(?= should)")
 # Further mistakes that one message names.
 _MOST_MISTAKES = 20
+# Of the psf in all; a full-size rig asks for 280.
+_MOST_BRACKETS = 10_000
 # 8K UHD and a little more.
 _MOST_VIEW_PX = 2**25
 
@@ -113,20 +115,27 @@ class Mounting(_Strict):
 class Captures(_Strict):
     """Numbers of captures in a full calibration; each trades time for accuracy."""
 
-    flats: Annotated[int, Field(ge=2)] = 300
-    noise_levels: Annotated[int, Field(ge=4)] = 20
-    noise_stack: Annotated[int, Field(ge=2)] = 16
-    psf_columns: Annotated[int, Field(ge=1)] = 7
-    psf_rows: Annotated[int, Field(ge=1)] = 5
-    psf_shifts: Annotated[int, Field(ge=1)] = 8
-    psf_exposures: Annotated[int, Field(ge=1)] = 7
-    psf_region_columns: Annotated[int, Field(ge=16)] = 256
-    psf_region_rows: Annotated[int, Field(ge=16)] = 512
-    psf_led_mm: Annotated[float, Field(gt=0)] = 1.15
-    psf_distance_mm: Annotated[float, Field(gt=0)] = 2000.0
-    backscatter_pictures: Annotated[int, Field(ge=2)] = 24
-    backscatter_frames: Annotated[int, Field(ge=2)] = 8
-    board_views: Annotated[int, Field(ge=3)] = 20
+    flats: Annotated[int, Field(ge=2, le=10000)] = 300
+    noise_levels: Annotated[int, Field(ge=4, le=1000)] = 20
+    noise_stack: Annotated[int, Field(ge=2, le=1000)] = 16
+    psf_columns: Annotated[int, Field(ge=1, le=100)] = 7
+    psf_rows: Annotated[int, Field(ge=1, le=100)] = 5
+    psf_shifts: Annotated[int, Field(ge=1, le=100)] = 8
+    psf_exposures: Annotated[int, Field(ge=1, le=30)] = 7
+    psf_region_columns: Annotated[int, Field(ge=16, le=16384)] = 256
+    psf_region_rows: Annotated[int, Field(ge=16, le=16384)] = 512
+    psf_led_mm: Annotated[float, Field(gt=0, le=1000)] = 1.15
+    psf_distance_mm: Annotated[float, Field(gt=0, le=1e6)] = 2000.0
+    backscatter_pictures: Annotated[int, Field(ge=2, le=1000)] = 24
+    backscatter_frames: Annotated[int, Field(ge=2, le=10000)] = 8
+    board_views: Annotated[int, Field(ge=3, le=1000)] = 20
+
+    @model_validator(mode="after")
+    def _can_be_captured(self) -> Captures:
+        brackets = self.psf_columns * self.psf_rows * self.psf_shifts
+        if brackets > _MOST_BRACKETS:
+            raise ValueError(f"{brackets} places of the LED with their shifts, which must be at most {_MOST_BRACKETS}")
+        return self
 
 
 class View(_Strict):

@@ -5,9 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import typer
+
+from udccal.cli.bench_options import BenchOptions, CameraKind, DisplayKind
+from udccal.cli.jobs.simulate import simulate_files
+from udccal.cli.output import Output
+from udccal.errors import UdccalError
 
 PORTRAIT = str(Path(__file__).resolve().parents[2] / "udccal" / "data" / "portrait.jpg")
 
@@ -83,6 +90,61 @@ def test_wrong_words_leave_with_status_2(words: list[str]) -> None:
     done = udccal(*words)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
+
+
+def test_wrong_words_are_an_object_for_a_program() -> None:
+    done = udccal("profile", "diff", "lg55-reduced", "--json")
+    assert done.returncode == 2
+    assert "Missing argument" in json.loads(done.stdout)["error"]
+
+
+def test_a_session_within_the_profile_is_refused(tmp_path: Path) -> None:
+    places = ["--session", str(tmp_path / "p" / "s"), "--profile", str(tmp_path / "p")]
+    assert udccal("calibrate", "--rig", "lg55-reduced", *places).returncode == 2
+    assert not any(tmp_path.iterdir())
+
+
+SIMULATED = BenchOptions(CameraKind.sim, None, None, DisplayKind.manual, 0, 0)
+REAL = replace(SIMULATED, camera=CameraKind.u3v)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        (replace(SIMULATED, files=Path("pictures")), "--files"),
+        (replace(SIMULATED, serial="40012345"), "--serial"),
+        (replace(SIMULATED, display=DisplayKind.window), "--display"),
+        (replace(SIMULATED, monitor=7), "--monitor"),
+        (replace(REAL, seed=3), "--seed"),
+        (replace(REAL, noise_seed=0), "--noise-seed"),
+    ],
+)
+def test_words_that_would_go_unheard_are_refused(options: BenchOptions, name: str) -> None:
+    with pytest.raises(typer.BadParameter, match=f"{name} is for --camera .* found {options.camera}"):
+        options.check_words({})
+
+
+def test_words_of_every_camera_are_heard() -> None:
+    for options in (
+        replace(SIMULATED, seed=3, noise_seed=0),
+        replace(REAL, serial="40012345", display=DisplayKind.window, monitor=7),
+        replace(SIMULATED, camera=CameraKind.files, files=Path("pictures")),
+    ):
+        options.check_words({})
+
+
+def test_photographs_of_one_name_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "b").mkdir()
+    pictures = [tmp_path / "a.jpg", tmp_path / "b" / "a.jpeg"]
+    with pytest.raises(UdccalError, match=r"a-mosaic\.png for .*a\.jpeg is taken by"):
+        simulate_files(Output(), pictures, "lg55-reduced", tmp_path / "out", None, 0)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_export_needs_a_name() -> None:
+    done = udccal("profile", "export", "lg55-reduced", "--to", "csv", "--out", "/")
+    assert done.returncode == 1
+    assert "found that / exists" in done.stderr
 
 
 def test_a_bug_asks_for_debug_and_shows_no_traceback() -> None:

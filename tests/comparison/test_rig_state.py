@@ -154,3 +154,9 @@ def test_terms_agree_on_a_camera_that_stands_on_its_head(measured: Profile) -> N
         assert abs(number(state, "roll_deg").value - 180.0) < 0.01
         assert state.agreement_dof == upright.agreement_dof
         assert state.agreement_p_value > 0.01
+
+
+def test_sigmas_of_any_size_have_a_decider() -> None:
+    known = Estimate("fx", 1.0, 1e200, "px", EstimatePrior(1.0, 1e200))
+    assert known.by_prior
+    assert not replace(known, sigma=1e199).by_prior

@@ -177,6 +177,10 @@ def test_a_window_goes_with_a_grid(toy_profile: Profile) -> None:
         (("camera", "K_DN_per_e", "tolerance"), 1e300),
         (("camera", "cfa"), "XYZW"),
         (("view",), {"columns": 16384, "rows": 16384}),
+        (("captures", "flats"), 10**400),
+        (("captures", "noise_levels"), 10**9),
+        (("captures", "board_views"), 10**8),
+        (("captures",), {"psf_columns": 100, "psf_rows": 100, "psf_shifts": 2}),
     ],
 )
 def test_a_rig_out_of_range_is_refused(folder: Path, document: dict[str, Any], path: Any, value: object) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, final
@@ -96,6 +96,22 @@ class BenchOptions:
             *most, last = for_led
             names = f"{', '.join(most)} and {last} are" if most else f"{last} is"
             raise typer.BadParameter(f"{names} for --camera u3v or pylon, and for --practice.")
+        for name, given, right, cameras in self._of_some_cameras():
+            if given and not right:
+                raise typer.BadParameter(
+                    f"{name} is for --camera {cameras}, found {self.camera}. Leave one of them out."
+                )
+
+    def _of_some_cameras(self) -> Iterator[tuple[str, bool, bool, str]]:
+        """Options that only some cameras have: name, whether it was given, whether this camera has it, and which do."""
+        simulated = self.camera is CameraKind.sim
+        shown = self.display is not DisplayKind.manual
+        yield "--files", self.files is not None, self.camera is CameraKind.files, "files"
+        yield "--serial", self.serial is not None, self.real, "u3v or pylon"
+        yield "--display", shown, self.real, "u3v or pylon"
+        yield "--monitor", self.monitor != 0, self.real, "u3v or pylon"
+        yield "--seed", self.seed != 0, simulated, "sim"
+        yield "--noise-seed", self.noise_seed is not None, simulated, "sim"
 
     def capture(self, output: Output, rig: RigDescription, wanted: Wanted, person: Person | None, agree: bool) -> bool:
         """Capture a session; return False when the person has stopped it.

@@ -94,7 +94,10 @@ def calibrate(
     from udccal.sessions.changes import Exchanged
 
     check_replaceable(profile)
-    check_writable(profile.parent)
+    for folder in (profile.parent, *(() if log is None else (log.parent,))):
+        check_writable(folder)
+    if session.resolve().is_relative_to(profile.resolve()):
+        raise typer.BadParameter("The profile is replaced as a whole: give --session a folder that is not within it.")
     wanted = Wanted(
         session, [t.value for t in term or TermChoice], {Exchanged(part.value) for part in exchanged or ()}, again or ()
     )

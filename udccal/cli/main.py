@@ -11,7 +11,7 @@ from udccal.cli.shown_text import shown
 from udccal.errors import UdccalError
 
 _GLOBAL_FLAGS = ("--json", "--debug")
-_FAILED, _BUG = 1, 70
+_FAILED, _WORDS, _BUG = 1, 2, 70
 # The statuses that a shell gives to programs which ended by SIGINT and by SIGPIPE.
 _STOPPED, _PIPE_CLOSED = 130, 141
 _CONTINUE = "Stopped. Run the same command again to continue; completed steps of a session are kept."
@@ -46,6 +46,8 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         _fail(_CONTINUE, _STOPPED, given)
     except SystemExit as left:  # typer turns Ctrl-C and a closed pipe into this, without a word
+        if left.code == _WORDS and left.__context__ is not None:
+            _answer_error(_sentence_of(left.__context__), given)
         if left.code == _STOPPED:
             _fail(_CONTINUE, _STOPPED, given)
         if isinstance(left.__context__, BrokenPipeError):
@@ -82,17 +84,27 @@ def _leave_the_rest() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _sentence_of(error: BaseException) -> str:
+    """What click says of words that it refuses; it has printed that on standard error."""
+    return error.format_message() if hasattr(error, "format_message") else str(error)
+
+
+def _answer_error(sentence: str, given: list[str]) -> None:
+    """Print the object that a program reads where it asked for one."""
+    if "--json" in given or "--json-events" in given:
+        import json
+
+        with suppress(OSError):  # standard output may be what failed
+            print(json.dumps({"error": sentence}), flush=True)
+
+
 def _fail(sentence: str, status: int, given: list[str]) -> None:
     """Print one sentence on standard error, with ``--debug`` the traceback before it; exit with a non-zero status."""
     if "--debug" in given:
         import traceback
 
         traceback.print_exc()
-    if "--json" in given or "--json-events" in given:
-        import json
-
-        with suppress(OSError):  # standard output may be what failed
-            print(json.dumps({"error": sentence}), flush=True)
+    _answer_error(sentence, given)
     print(f"udccal: {shown(' '.join(sentence.split()))}", file=sys.stderr, flush=True)
     # An interrupt while Python runs text, as it does to make a dataclass, marks the process as ended by the signal,
     # even where it was caught. Running text once more takes the mark back: the status is the one given here.

@@ -66,9 +66,9 @@ class Output:
     times: list[StageTime] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._people = Console(stderr=True)
+        self._people = Console(stderr=True, emoji=False)
         self._bar: Progress | None = None
-        self._standard = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
+        self._standard = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH, emoji=False)
 
     def say(self, sentence: str) -> None:
         """Print a sentence for the user on standard error."""

@@ -29,7 +29,7 @@ def check_comparable(a: Profile, b: Profile) -> None:
 
 
 def check_same_rig(profile: Profile, rig: RigDescription, taken_by: StoredCamera) -> None:
-    """Refuse a profile that does not describe the rig and the camera of a session.
+    """Refuse a profile that does not describe the rig and the camera of captures.
 
     Raises:
         ProfileError: when rig, panel, sensor or camera differ; the message names the first difference.
@@ -37,8 +37,8 @@ def check_same_rig(profile: Profile, rig: RigDescription, taken_by: StoredCamera
     if (found := _difference(profile.rig, profile.provenance.camera, rig, taken_by)) is not None:
         what, first, second = found
         raise ProfileError(
-            f"Expected a session of the profile's rig, found another {what}: {second} in the session, {first} in the "
-            "profile. Give a session of the same rig and camera."
+            f"Expected captures of the profile's rig, found another {what}: {second}, and {first} in the profile. "
+            "Use the same rig and camera."
         )
 
 

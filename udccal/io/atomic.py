@@ -16,7 +16,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     On an error nothing is left behind, and an earlier file at ``path`` stays as it was. A link at ``path`` is replaced,
     not followed.
     """
-    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(6)}.partial{path.suffix}")
+    temporary = path.parent / f".{path.stem}-{secrets.token_hex(6)}.partial{path.suffix}"
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # O_EXCL refuses links and existing files
     try:
         yield temporary

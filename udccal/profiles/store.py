@@ -20,7 +20,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME
 from udccal.profiles.schema import StoredArray, StoredProfile
 from udccal.profiles.versions import migrated
-from udccal.rig_folders import find_rig, rig_names, shipped_rig_folder, user_rig_folder
+from udccal.rig_folders import find_rig, rig_folders, rig_names
 
 # Name of the profile in a rig's folder, next to rig.toml.
 RIG_PROFILE = "profile"
@@ -128,8 +128,8 @@ def find_profile(name_or_path: str | Path) -> Path:
 
 
 def _rigs_with_profiles() -> list[str]:
-    folders = user_rig_folder(), shipped_rig_folder()
-    return [name for folder in folders for name in rig_names(folder) if standing(folder / name / RIG_PROFILE).is_dir()]
+    each = ((folder / name, name) for folder in rig_folders() for name in rig_names(folder))
+    return [name for rig, name in each if standing(rig / RIG_PROFILE).is_dir()]
 
 
 def read_stored(folder: Path) -> StoredProfile:

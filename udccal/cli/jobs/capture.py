@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence, Set
+from collections.abc import Callable, Collection, Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +11,8 @@ from typing import final
 from udccal.benches.bench import CaptureBench
 from udccal.benches.capture import TERMS, capture_term
 from udccal.cli.output import Output
-from udccal.comparison.comparable import check_same_rig
 from udccal.errors import SessionError, did_you_mean
-from udccal.profiles.profile import Profile
-from udccal.sessions.changes import Exchanged, stored_camera
+from udccal.sessions.changes import Exchanged
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
@@ -30,14 +28,14 @@ class Wanted:
         terms: terms to capture.
         exchanged: parts of the rig that were exchanged on purpose since the session began.
         again: ids of captured steps to capture once more; each stays until its new captures are whole.
-        like: profile whose rig and camera this must be; None for any.
+        before: called with the rig when it is there, before anything is captured; what it raises ends the capture.
     """
 
     session: Path
     terms: Sequence[TermName]
     exchanged: Set[Exchanged] = frozenset()
     again: Collection[str] = ()
-    like: Profile | None = None
+    before: Callable[[CaptureBench], None] | None = None
 
     @property
     def pictures(self) -> Path:
@@ -65,11 +63,11 @@ def open_session(output: Output, bench: CaptureBench, wanted: Wanted) -> Iterato
     """Begin or continue a session, and say what is damaged in it.
 
     Raises:
-        ProfileError: when rig or camera are not those of ``wanted.like``; nothing has been captured then.
+        UdccalError: as ``wanted.before`` does; nothing has been captured then.
         SessionError: when a step of ``wanted.again`` was not captured, or is of another term; also from the session.
     """
-    if wanted.like is not None:
-        check_same_rig(wanted.like, bench.rig, stored_camera(bench.camera.identity))
+    if wanted.before is not None:
+        wanted.before(bench)
     if wanted.again:
         _check_captured(Session.open(wanted.session), wanted.again, wanted.terms)
     with SessionWriter.create_or_resume(

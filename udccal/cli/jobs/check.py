@@ -6,10 +6,12 @@ import json
 import shutil
 from pathlib import Path
 
+from udccal.benches.bench import CaptureBench
 from udccal.cli.bench_options import BenchOptions
 from udccal.cli.jobs.capture import Wanted
 from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output, plain
+from udccal.comparison.comparable import check_same_rig
 from udccal.compilation import keep_compilations
 from udccal.drift.check import RigCheck, Solved, check_measured, check_rig, short_rig
 from udccal.drift.update import updated
@@ -20,6 +22,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.store import check_replaceable, load_profile, write_profile
 from udccal.reports.check_page import changes_table, check_page
 from udccal.reports.page import write_page
+from udccal.sessions.changes import stored_camera
 from udccal.sessions.store import Session
 
 
@@ -53,13 +56,7 @@ def check_profile(
     profile = load_profile(path)
     check_measured(profile)
     rig, folder = short_rig(profile.rig), out / "session"
-    with storing_in(out):
-        if (out / "check.json").exists():
-            _put_aside(folder)
-        # They would else stay beside captures that they do not tell of.
-        for file in (out / "check.html", out / "check.json"):
-            file.unlink(missing_ok=True)
-    wanted = Wanted(folder, ("wire", "backscatter"), like=profile)
+    wanted = Wanted(folder, ("wire", "backscatter"), before=lambda bench: _begin(profile, bench, out))
     person = TerminalPerson(output) if options.led else None
     if not options.capture(output, rig, wanted, person, agree):
         return None
@@ -79,6 +76,17 @@ def check_profile(
     output.say(f"Written: {out / 'check.html'} and {out / 'check.json'}")
     output.result(found)
     return found.verdict != "changed"
+
+
+def _begin(profile: Profile, bench: CaptureBench, out: Path) -> None:
+    """Put the results of the last check aside, now that the rig of the profile is there for a new one."""
+    check_same_rig(profile, bench.rig, stored_camera(bench.camera.identity))
+    with storing_in(out):
+        if (out / "check.json").exists():
+            _put_aside(out / "session")
+        # They would else stay beside captures that they do not tell of.
+        for file in (out / "check.html", out / "check.json"):
+            file.unlink(missing_ok=True)
 
 
 def _compared(profile: Profile, session: Path, out: Path) -> tuple[RigCheck, Solved]:

@@ -130,6 +130,7 @@ def _iterations_to(output: Output, path: Path | None) -> Iterator[None]:
         yield
         return
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         refuse_links(path.parent, path)
         handler = _IterationLog(path, mode="w", encoding="utf-8")
     except OSError as error:

@@ -15,7 +15,7 @@ from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import storing_in
 from udccal.reports.tables import Table
 from udccal.rig import RIG_NAME, RigDescription, load_rig
-from udccal.rig_folders import RIG_FILE, find_rig, rig_names, shipped_rig_folder, user_rig_folder
+from udccal.rig_folders import RIG_FILE, find_rig, rig_folders, rig_names, shipped_rig_folder, user_rig_folder
 
 _NAME_LINE = re.compile(r"""^[ \t]*(name|"name"|'name')[ \t]*=.*$""", re.MULTILINE)
 
@@ -36,9 +36,9 @@ class KnownRig:
 @final
 @dataclass(frozen=True)
 class KnownRigs:
-    """Result of ``rig list``; ``own_folder`` is where a person's own rigs go."""
+    """Result of ``rig list``; ``own_folder`` is where a person's own rigs go, None without a home folder."""
 
-    own_folder: Path
+    own_folder: Path | None
     rigs: tuple[KnownRig, ...]
 
 
@@ -74,11 +74,12 @@ class CheckedRig:
 
 def list_rigs(output: Output) -> None:
     """List the rigs that can be named: a person's own, then the shipped ones."""
-    own, shipped = user_rig_folder(), shipped_rig_folder()
-    rigs = tuple(_known(folder / name, folder == own) for folder in (own, shipped) for name in rig_names(folder))
+    own = user_rig_folder()
+    rigs = tuple(_known(folder / name, folder == own) for folder in rig_folders() for name in rig_names(folder))
     rows = tuple((r.name, "yours" if r.own else "shipped", r.problem or f"{r.panel}; {r.camera}") for r in rigs)
     output.table(Table("Rigs", ("name", "whose", "panel and camera"), rows))
-    output.say(f"Your own rigs are in {own}. Begin one with: udccal rig new NAME")
+    where = "Name a folder for your own rigs with UDCCAL_RIGS." if own is None else f"Your own rigs are in {own}."
+    output.say(f"{where} Begin one with: udccal rig new NAME")
     output.result(KnownRigs(own, rigs))
 
 
@@ -94,7 +95,10 @@ def new_rig(output: Output, name: str, like: str) -> None:
             f"Expected a name of at most 64 lower-case letters, digits, dots, dashes and underscores, found '{name}'. "
             "Choose another name."
         )
-    folder = user_rig_folder() / name
+    own = user_rig_folder()
+    if own is None:
+        raise RigError("Expected a folder for your own rigs, found no home folder. Name one with UDCCAL_RIGS.")
+    folder = own / name
     if folder.exists() or name in rig_names(shipped_rig_folder()):
         raise RigError(f"Expected a name that is free, found that there is a rig '{name}'. Choose another name.")
     load_rig(like)

@@ -12,6 +12,7 @@ from udccal.benches.bench import simulated_rig
 from udccal.benches.photograph import CapturedScene, capture_photograph
 from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.output import Output
+from udccal.errors import UdccalError
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16
@@ -59,9 +60,11 @@ def simulate_files(
     Raises:
         RigError: when the rig is not known.
         FileFormatError: when a photograph or the panel's picture cannot be read.
+        UdccalError: when the results of two photographs would have one name, or the name of a photograph.
         UdccalError: when ``out`` cannot be written to; this is found before any work.
     """
     check_writable(out)
+    _check_names(images, out)
     rig = load_rig(rig_name)
     shown = None if panel_picture is None else read_panel_picture(panel_picture, rig)
     files: list[SimulatedFile] = []
@@ -79,6 +82,23 @@ def simulate_files(
     output.result(SimulateSummary(rig.name, seed, tuple(files)))
 
 
+def _results(out: Path, image: Path) -> tuple[Path, Path, Path]:
+    mosaic, preview, ideal = (out / f"{image.stem}-{kind}.png" for kind in ("mosaic", "preview", "ideal"))
+    return mosaic, preview, ideal
+
+
+def _check_names(images: list[Path], out: Path) -> None:
+    taken = {image.resolve(): image for image in images}
+    for image in images:
+        for file in _results(out, image):
+            if (other := taken.get(file.resolve())) is not None:
+                raise UdccalError(
+                    f"Expected names that differ in {out}, found that {file.name} for {image} is taken by {other}. "
+                    "Rename a photograph, or choose another folder."
+                )
+            taken[file.resolve()] = image
+
+
 def _normalised(radiance: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
     """Scale radiance so that its 97th percentile is 1: as bright as white paper in a lit room."""
     return radiance / max(float(np.percentile(radiance, 97.0)), 1e-9)
@@ -86,7 +106,7 @@ def _normalised(radiance: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarr
 
 def _write(out: Path, image: Path, scene: CapturedScene, rig: RigDescription) -> SimulatedFile:
     out.mkdir(parents=True, exist_ok=True)
-    mosaic, preview, ideal = (out / f"{image.stem}-{kind}.png" for kind in ("mosaic", "preview", "ideal"))
+    mosaic, preview, ideal = _results(out, image)
     write_png16(mosaic, scene.mosaic)
     quick = mosaic_preview(scene.mosaic, rig.camera.cfa, rig.camera.black_DN.value)
     for name, picture in ((preview, quick), (ideal, scene.ideal)):

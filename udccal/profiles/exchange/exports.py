@@ -53,7 +53,7 @@ class _Covariances:
 
 def covariance_file(path: Path) -> Path:
     """Return where the covariance of an exported file goes: its name with ``.json`` after it."""
-    return path.with_name(f"{path.name}.json")
+    return Path(f"{path}.json")
 
 
 def export_profile(profile: Profile, to: ExportFormat, path: Path) -> None:
