@@ -26,10 +26,12 @@ def led(
     terms: list[TermName],
     react: Reaction = lambda event, offered: None,
     painted: PaintedRig | None = None,
+    again: tuple[str, ...] = (),
 ) -> Scripted:
     painted = painted or PaintedRig(painted_rig(psf_columns=2, psf_rows=1))
     bench, person = painted_bench(painted), Scripted(react)
     with SessionWriter.create_or_resume(folder, bench.rig, bench.camera.identity, now=bench.now) as writer:
+        writer.capture_again(again)
         done = lead_capture(writer, bench, person, terms)
     assert person.done is done
     return person
@@ -291,6 +293,25 @@ def test_a_step_that_is_left_after_back_stays_as_it_was(tmp_path: Path) -> None:
     person = led(tmp_path, ["wire"], react)
     assert person.done.complete
     assert Session.open(tmp_path).step("wire/flat") == went[0]
+
+
+def test_a_refusal_leaves_what_is_captured_again_as_it_was_asked_for(tmp_path: Path) -> None:
+    led(tmp_path, ["noise"])
+    before = Session.open(tmp_path)
+    painted = PaintedRig(before.manifest.rig)
+    painted.put = FlatLight()
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if isinstance(event, VerdictEvent) and not event.ok:
+            painted.put = None
+        return Answer.go
+
+    person = led(tmp_path, ["noise"], react, painted, again=("noise/dark_1",))
+    assert "Expected a dark frame" in " ".join(person.sentences("noise/dark_stack"))
+    assert person.done.complete
+    after = Session.open(tmp_path)
+    new = [step.id for step in after.manifest.steps if step != before.step(step.id)]
+    assert new == ["noise/dark_1"]
 
 
 def test_quit_keeps_what_is_captured_and_the_next_run_continues(tmp_path: Path) -> None:

@@ -117,9 +117,8 @@ class Leading:
             return self._verdict(step, False, sentence, _LACKING)
         if self._captured(step):
             self.writer.capture_again(step.step_ids)
-        try:
-            answer = self._carry_out(step)
-        finally:
+        answer = self._carry_out(step)
+        if answer is not Answer.again:  # else the next visit captures what this one has left
             self.writer.keep_captured(step.step_ids)
         return answer
 
