@@ -88,7 +88,7 @@ class BoardVisit:
         wanted = Outline(_polygon(_edge(self._rig, self._board)), "wanted")
         return Look(frame, readings, self._why_not(readings), (wanted, *seen.outlines))
 
-    def capture(self) -> Iterator[None]:
+    def capture(self) -> Iterator[int]:
         """Take the view; raises as ``run_step`` does."""
         view = self._seen[-1]
         self._seen.clear()
@@ -96,7 +96,7 @@ class BoardVisit:
         self._count(view)
         if any(step_id not in self._writer.completed_ids for step_id in self._step_ids):
             self._asked = self._ask()
-        yield
+        yield 0
 
     def _count(self, view: CornersSeen) -> None:
         self._views.append(view)

@@ -89,11 +89,14 @@ class LedVisit:
     """Implements ``udccal.guide.steps.Visit`` for one cell of the field: a capture is one bracket.
 
     A cell that was left half done begins anew: nobody brings the LED back to within the few px that its brackets share.
+    Where the session holds all of a cell, its brackets are exchanged together: old and new ones do not lie together.
     """
 
     def __init__(self, cell: FieldCell, exposure: Metered, bench: Bench, writer: SessionWriter) -> None:
         self._rig, self._cell, self._exposure = writer.manifest.rig, cell, exposure
         self._bench, self._writer = bench, writer
+        self._exchanged = all(writer.step(step_id) is not None for step_id in cell.step_ids)
+        self._waiting: list[tuple[str, LedSubject, tuple[Capture, ...]]] = []
         writer.capture_again([step_id for step_id in cell.step_ids if step_id in writer.completed_ids])
         self._live = LiveFrames(bench.camera, whole_sensor(self._rig), exposure, self._rig)
         self._taken_px: list[Place] = []
@@ -119,7 +122,7 @@ class LedVisit:
         outlines = (self._wanted(), Outline((led.place_px,), "seen"))
         return Look(frame, readings, self._where_next(readings, led.place_px), outlines)
 
-    def capture(self) -> Iterator[None]:
+    def capture(self) -> Iterator[int]:
         """Take a bracket of the LED where it rests.
 
         Raises:
@@ -136,11 +139,21 @@ class LedVisit:
         led = LedSubject(
             x_px=place[0], y_px=place[1], distance_mm=self._asked.distance_mm, diameter_mm=self._asked.diameter_mm
         )
-        self._writer.add_step(step_id, "psf", led, captures)
+        self._waiting.append((step_id, led, captures))
         self._taken_px.append(place)
-        if len(self._taken_px) < len(self._cell.step_ids):
+        whole = len(self._taken_px) == len(self._cell.step_ids)
+        if whole or not self._exchanged:
+            self._store()
+        if not whole:
             self._ask_from(place, self._next_phase())
-        yield
+        yield sum(len(taken) for _, _, taken in self._waiting)
+
+    def _store(self) -> None:
+        """Add the brackets that wait; with a cell's first one, those of an earlier visit leave the session."""
+        first, *others = self._cell.step_ids
+        for step_id, led, captures in self._waiting:
+            self._writer.add_step(step_id, "psf", led, captures, without=others if step_id == first else ())
+        self._waiting.clear()
 
     def _held_place(self, first: Capture, region: Region) -> Place:
         """Return where the LED was in the first frame of a bracket, once it is sure that it still is there."""

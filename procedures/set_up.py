@@ -105,14 +105,14 @@ class SetUpVisit:
             case _:
                 return self._judged(frame, (room,))
 
-    def capture(self) -> Iterator[None]:
+    def capture(self) -> Iterator[int]:
         """Capture the missing steps in their order; raises as ``run_step`` does."""
         before: str | None = None
         for step in self._steps(self._rig):
             if step.id in self._step_ids and step.id not in self._writer.completed_ids:
                 start_s = exposure_of(before, self._writer)
                 run_step(step, self._bench, self._writer, start_s, self._steps(self._rig))
-                yield
+                yield 0
             before = step.id
 
     def _missing(self) -> Iterator[Step]:

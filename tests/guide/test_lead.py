@@ -37,6 +37,10 @@ def led(
     return person
 
 
+def counted(person: Scripted) -> list[int]:
+    return [event.frames for event in person.events if isinstance(event, ProgressEvent)]
+
+
 @pytest.mark.medium
 def test_a_whole_rig_takes_at_most_40_prompts(tmp_path: Path) -> None:
     rig, real = painted_rig(4, psf_shifts=1, board_views=3), load_rig("lg55-aca2040")
@@ -293,6 +297,49 @@ def test_a_step_that_is_left_after_back_stays_as_it_was(tmp_path: Path) -> None:
     person = led(tmp_path, ["wire"], react)
     assert person.done.complete
     assert Session.open(tmp_path).step("wire/flat") == went[0]
+
+
+def leaves(painted: PaintedRig, brackets: int, answer: Answer) -> Reaction:
+    """Answer once so many brackets of an LED are taken, then quit: the LED is asked to another place after each."""
+    said: list[Answer] = []
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if len(set(painted.asked)) <= brackets:
+            return None
+        said.append(Answer.quit if said else answer)
+        return said[-1]
+
+    return react
+
+
+@pytest.mark.parametrize("answer", [Answer.skip, Answer.back, Answer.quit])
+def test_a_cell_that_is_left_while_it_is_captured_again_stays_as_it_was(tmp_path: Path, answer: Answer) -> None:
+    led(tmp_path, ["psf"])
+    before = Session.open(tmp_path).manifest
+    painted = PaintedRig(before.rig, offset_px=3.0)
+    person = led(tmp_path, ["psf"], leaves(painted, 1, answer), painted, again=("psf/p00_s0",))
+    assert counted(person) == [2]  # one bracket was taken anew
+    assert Session.open(tmp_path).manifest.steps == before.steps
+    assert led(tmp_path, ["psf"]).visited == []
+
+
+def test_a_cell_that_is_captured_again_is_exchanged_as_a_whole(tmp_path: Path) -> None:
+    led(tmp_path, ["psf"])
+    before = Session.open(tmp_path)
+    painted = PaintedRig(before.manifest.rig, offset_px=3.0)
+    person = led(tmp_path, ["psf"], painted=painted, again=("psf/p00_s0",))
+    assert counted(person) == [2, 4]
+    after = {step.id: step for step in Session.open(tmp_path).manifest.steps}
+    assert sorted(after) == sorted(step.id for step in before.manifest.steps)
+    new = {step_id for step_id, step in after.items() if step != before.step(step_id)}
+    assert new == {"psf/p00_s0", "psf/p00_s1"}
+
+
+def test_what_is_left_of_a_half_done_cell_leaves_when_it_begins_anew(tmp_path: Path) -> None:
+    for brackets, held in ((2, ["psf/p00_s0", "psf/p00_s1"]), (1, ["psf/p00_s0"])):
+        painted = PaintedRig(painted_rig(psf_columns=1, psf_rows=1, psf_shifts=3))
+        led(tmp_path, ["psf"], leaves(painted, brackets, Answer.quit), painted)
+        assert [step.id for step in Session.open(tmp_path).steps("psf")] == held
 
 
 def test_a_refusal_leaves_what_is_captured_again_as_it_was_asked_for(tmp_path: Path) -> None:

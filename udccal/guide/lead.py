@@ -136,8 +136,8 @@ class Leading:
             if answer is None and not (step.by_itself and look is not None and look.in_order):
                 continue
             try:
-                for _ in visit.capture():
-                    self.person.tell(ProgressEvent(step.id, self._frames(step), step.frames))
+                for waiting in visit.capture():
+                    self.person.tell(ProgressEvent(step.id, self._frames(step) + waiting, step.frames))
             except _MENDABLE as error:
                 if not step.by_itself:
                     return self._refused(step, str(error))

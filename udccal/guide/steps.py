@@ -49,8 +49,11 @@ class Visit(Protocol):
         """
         ...
 
-    def capture(self) -> Iterator[None]:
-        """Capture what stands before the camera; yield after each step that the session has gained.
+    def capture(self) -> Iterator[int]:
+        """Capture what stands before the camera.
+
+        Yields:
+            after each step that was captured, how many frames wait until the session gains them together.
 
         Raises:
             CaptureError: when the camera does not see what is needed.
