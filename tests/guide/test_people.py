@@ -184,6 +184,22 @@ def test_a_closed_input_is_said_only_where_an_answer_is_waited_for(monkeypatch: 
         person.answer(ASKED, 0.1)
 
 
+def test_whoever_agrees_lets_a_set_up_come_into_order_with_nobody_at_the_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = typed(monkeypatch, "")
+    patient, impatient = Agreeing(closed), Agreeing(closed, set_up_s=0.0)
+    for person in (patient, impatient):
+        person.tell(STEP)
+        person.tell(looked(BAD))
+    assert patient.answer(ASKED, 0.1) is None
+    with pytest.raises(UdccalError, match="standard input is closed"):
+        impatient.answer(ASKED, 0.1)
+    patient.tell(looked(GOOD))
+    assert patient.answer(ASKED, 0.1) is Answer.go
+    patient.tell(VerdictEvent("wire/flat", False, "Refused.", ASKED))
+    with pytest.raises(UdccalError, match="standard input is closed"):
+        patient.answer(ASKED, 3600.0)
+
+
 def test_readings_are_printed_when_they_say_something_else(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Protocol, final, runtime_checkable
+import time
+from typing import Final, Protocol, final, runtime_checkable
 
 from udccal.arrangements import Arrangement, Occasion
 from udccal.cameras.protocol import Frame
-from udccal.guide.events import Answer, Event, Outline, Person, ReadingsEvent, VerdictEvent, in_order
+from udccal.guide.events import Answer, Event, Outline, Person, ReadingsEvent, StepEvent, VerdictEvent, in_order
+
+_SET_UP_S: Final = 300.0
 
 
 @final
@@ -19,14 +22,26 @@ class ByHand:
 
 @final
 class Agreeing:
-    """Implements ``Person``: goes on by itself wherever all is in order, and asks another person where it is not."""
+    """Implements ``Person``: goes on by itself wherever all is in order, and asks another person where it is not.
 
-    def __init__(self, person: Person) -> None:
-        self._person = person
-        self._in_order = False
+    A set-up has some time to come into order by itself, as one does whose movement the first looks do not know yet.
+    Whoever says something meanwhile is heard, but nobody has to be there.
+    """
+
+    def __init__(self, person: Person, set_up_s: float = _SET_UP_S) -> None:
+        """Args:
+        person: who is asked.
+        set_up_s: how long after a step has begun its looks wait for nobody.
+        """
+        self._person, self._set_up_s = person, set_up_s
+        self._in_order = self._looking = False
+        self._until_s = 0.0
 
     def tell(self, event: Event) -> None:
         """Pass the event on."""
+        self._looking = isinstance(event, ReadingsEvent)
+        if isinstance(event, StepEvent):
+            self._until_s = time.monotonic() + self._set_up_s
         match event:
             case ReadingsEvent(readings=readings, sentence=sentence):
                 self._in_order = in_order(readings, sentence)
@@ -44,7 +59,8 @@ class Agreeing:
         """Answer ``go`` where all is in order."""
         if self._in_order and Answer.go in offered:
             return Answer.go
-        return self._person.answer(offered, wait_s)
+        coming = self._looking and time.monotonic() < self._until_s
+        return self._person.answer(offered, 0.0 if coming else wait_s)
 
 
 @runtime_checkable
