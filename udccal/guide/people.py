@@ -59,8 +59,12 @@ class Agreeing:
         """Answer ``go`` where all is in order."""
         if self._in_order and Answer.go in offered:
             return Answer.go
-        coming = self._looking and time.monotonic() < self._until_s
-        return self._person.answer(offered, 0.0 if coming else wait_s)
+        if not self._looking or time.monotonic() >= self._until_s:
+            return self._person.answer(offered, wait_s)
+        answer = self._person.answer(offered, 0.0)
+        if answer is None:
+            time.sleep(wait_s)
+        return answer
 
 
 @runtime_checkable
