@@ -20,8 +20,10 @@ _REPORT = "Something unexpected went wrong ({}). Run the same command with --deb
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command and exit with its status, which docs/cli.md explains: 0, 1, 2, 3, 70, 130 or 141."""
-    # Silences XLA's own log before JAX is imported: whatever matters in it also comes as an exception.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # Silences XLA's own log before JAX is imported: whatever matters in it also comes as an exception. A program that
+    # has imported JAX hands its default, 1, to its children: 2 kB for every kept compilation, which fill a pipe.
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
     given = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal or file of few letters gets question marks for the rest
