@@ -11,18 +11,40 @@ from udccal.doctor.cameras import camera_finding, pylon_sdk_finding, rig_finding
 from udccal.doctor.finding import Finding, Status
 from udccal.rig import load_rig
 
-GOOD = SeenCamera("Basler ace 1")
-SLOW = SeenCamera("Basler ace 2", too_slow=True)
-HELD = SeenCamera("Basler ace 3", trouble="Expected it free, found it held. Close that program.")
+GOOD = SeenCamera("Basler ace 1", serial="1")
+SLOW = SeenCamera("Basler ace 2", too_slow=True, serial="2")
+HELD = SeenCamera("Basler ace 3", trouble="Expected it free, found it held. Close that program.", serial="3")
+HIDDEN = SeenCamera("a camera without a name", trouble="Expected permission. Install the rule.")
 
 
 @pytest.mark.parametrize("asked", [False, True])
 def test_a_camera_that_can_be_opened_is_fine(asked: bool) -> None:
-    finding = camera_finding("u3v", (GOOD, SLOW, HELD), asked)
+    finding = camera_finding("u3v", (GOOD, SLOW, HELD), asked, "1")
     assert finding.topic == "cameras by u3v"
     assert finding.status is Status.OK
     assert "Basler ace 1; Basler ace 2 (at a port or cable that is slower than the camera)" in finding.found
     assert "Close that program" in finding.advice
+
+
+@pytest.mark.parametrize(
+    ("seen", "serial", "advice"),
+    [
+        ((GOOD,), None, ""),
+        ((GOOD, SLOW), None, "Expected one camera, found 2. Choose one with --serial."),
+        ((GOOD, SLOW), "2", ""),
+        ((GOOD, SLOW), "4", "Expected a camera of the serial number 4, found 1, 2."),
+        ((GOOD, HELD), "3", "Close that program"),
+        ((GOOD, HIDDEN), "4", "Install the rule."),
+    ],
+    ids=["only one", "several", "that one", "another", "held", "unreadable"],
+)
+def test_the_camera_of_that_serial_number_must_be_there(
+    seen: tuple[SeenCamera, ...], serial: str | None, advice: str
+) -> None:
+    finding = camera_finding("u3v", seen, True, serial)
+    assert finding.status is (Status.PROBLEM if advice else Status.OK)
+    assert advice in finding.advice
+    assert camera_finding("u3v", seen, False, serial).status is Status.OK
 
 
 @pytest.mark.parametrize(

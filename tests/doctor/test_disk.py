@@ -115,11 +115,24 @@ def test_a_place_that_cannot_hold_a_session_is_a_problem(session: Path, tmp_path
     assert "JSON" in finding.advice
 
 
-def test_what_is_missing_is_what_was_not_captured(session: Path) -> None:
+def test_a_session_of_another_rig_is_a_problem(session: Path) -> None:
+    """A capture into it would be refused."""
+    finding = disk_finding(session, load_rig(RIGS / "lg55-aca2040"), lambda folder: 10**15)
+    assert finding.status is Status.PROBLEM
+    assert "of the rig 'lg55-aca2040' as it is described now" in finding.advice
+    # A lens may be exchanged during a session.
+    rig = small_rig()
+    other_lens = rig.model_copy(update={"lens": rig.lens.model_copy(update={"model": "another"})})
+    assert disk_finding(session, other_lens, lambda folder: 10**15).status is Status.OK
+
+
+def test_what_is_missing_is_what_was_not_captured(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = read_manifest(session).rig
     missing = session_bytes(rig) - captured_bytes(read_manifest(session))
     no_views = rig.model_copy(update={"captures": rig.captures.model_copy(update={"board_views": -1})})
     assert missing == session_bytes(rig) - session_bytes(no_views)
+    of_no_views = read_manifest(session).model_copy(update={"rig": no_views})
+    monkeypatch.setattr("udccal.doctor.disk.read_manifest", lambda path: of_no_views)
     finding = disk_finding(session, no_views, lambda folder: 0)
     assert finding.status is Status.OK
     assert finding.found.endswith("and is complete")

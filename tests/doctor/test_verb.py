@@ -94,6 +94,18 @@ def test_what_was_asked_for_and_cannot_work_is_a_problem(
     assert {finding.topic for finding in found if finding.status is Status.PROBLEM} == topics
 
 
+@pytest.mark.parametrize("backend", ["u3v", "pylon"])
+def test_a_camera_of_another_serial_number_is_a_problem(
+    backend: str, wired: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = (SeenCamera("Basler ace 1", serial="1"),)
+    answers = {Question.U3V: seen, Question.PYLON: seen, Question.JAX: (JaxDevice("cpu", "cpu"),)}
+    monkeypatch.setattr(examining, "ask", lambda question, read, seconds, words=(): answers[question])
+    for serial, problems in (("1", set()), ("2", {f"cameras by {backend}"})):
+        found = examine(Wanted(camera=backend, serial=serial, machine=wired))
+        assert {one.topic for one in found if one.status is Status.PROBLEM} == problems
+
+
 def test_a_hanging_backend_is_one_row_and_the_others_are_there(wired: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(examining, "ask", fake_ask(Failure("no answer within 30 s")))
     found = {finding.topic: finding for finding in examine(Wanted(camera="u3v", machine=wired))}
@@ -151,9 +163,8 @@ def test_the_exit_status_says_whether_what_was_asked_for_can_work(tmp_path: Path
         ({"columns = 4096": "columns = 128"}, "", "PROBLEM", "Expected a camera of 128 x 4096"),
         ({"bits = 12": "bits = 14"}, "", "PROBLEM", "a pixel format of 14 bits and the pattern RGGB"),
         ({"frame_rate_hz = 120.0": "frame_rate_hz = 9000.0"}, "", "NOTE", "The rig says 9000 Hz"),
-        ({}, "4711", "PROBLEM", "serial number 4711"),
     ],
-    ids=["fits", "size", "bits", "rate", "serial"],
+    ids=["fits", "size", "bits", "rate"],
 )
 def test_the_camera_is_opened_and_compared_with_the_rig(
     changes: dict[str, str], serial: str, status: str, said: str, tmp_path: Path, emulated_camera: None
@@ -168,6 +179,21 @@ def test_the_camera_is_opened_and_compared_with_the_rig(
     assert said in finding["advice"]
     assert summary["ready"] is (status != "PROBLEM")
     assert done.returncode == (1 if status == "PROBLEM" else 0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--serial", "123"], "give --camera u3v or pylon with it"),
+        (["--serial", "123", "--camera", "sim"], "give --camera u3v or pylon with it"),
+        (["--monitor", "5"], "give --display window with it"),
+        (["--monitor", "0", "--display", "manual"], "give --display window with it"),
+    ],
+)
+def test_options_of_which_nothing_would_be_checked_are_refused(words: list[str], said: str) -> None:
+    done = udccal(*words)
+    assert done.returncode == 2
+    assert said in " ".join(done.stderr.replace("│", " ").split())
 
 
 def test_an_unknown_rig_is_one_sentence() -> None:

@@ -23,17 +23,23 @@ def doctor(
     ] = None,
     serial: Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")] = None,
     display: Annotated[DisplayKind | None, typer.Option("--display", help="Display to use: it must be ready.")] = None,
-    monitor: Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel.")] = 0,
+    monitor: Annotated[
+        int | None, typer.Option("--monitor", help="Number of the monitor that is the panel, 0 where it is left out.")
+    ] = None,
 ) -> None:
     """Check this computer before a capture. The exit status is 1 when something that you asked for cannot work."""
     from udccal.cli.jobs.doctor import report
     from udccal.doctor.examine import Wanted
     from udccal.rig import load_rig
 
+    if serial is not None and camera not in (CameraKind.u3v, CameraKind.pylon):
+        raise typer.BadParameter("--serial is a real camera's: give --camera u3v or pylon with it, or leave it out.")
+    if monitor is not None and display is not DisplayKind.window:
+        raise typer.BadParameter("--monitor is for a window: give --display window with it, or leave it out.")
     wanted = Wanted(
         camera=None if camera is None else camera.value,
         serial=serial,
-        monitor=monitor if display is DisplayKind.window else None,
+        monitor=(monitor or 0) if display is DisplayKind.window else None,
         rig=None if rig is None else load_rig(rig),
         session=session,
     )

@@ -17,11 +17,13 @@ class SeenCamera:
         name: maker, model and serial.
         too_slow: whether its port is slower than the camera supports, as far as the backend knows.
         trouble: why it cannot be opened, as a sentence; empty when no reason is known.
+        serial: its serial number; empty when it cannot be read.
     """
 
     name: str
     too_slow: bool = False
     trouble: str = ""
+    serial: str = ""
 
 
 @final

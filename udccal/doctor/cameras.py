@@ -16,8 +16,13 @@ _BROKEN = "Unplug the camera and run this again. If that does not help, install 
 _SLOW = " (at a port or cable that is slower than the camera)"
 
 
-def camera_finding(backend: str, answer: tuple[SeenCamera, ...] | Failure, asked: bool) -> Finding:
-    """Return a backend's answer; it is a problem when that backend is wanted and has no camera to open."""
+def camera_finding(
+    backend: str, answer: tuple[SeenCamera, ...] | Failure, asked: bool, serial: str | None = None
+) -> Finding:
+    """Return a backend's answer; it is a problem when that backend is wanted and has not the one camera to open.
+
+    ``serial`` is the wanted camera's serial number; None for the only camera.
+    """
     topic = f"cameras by {backend}"
     if isinstance(answer, Failure):
         found = "it cannot look for any" if answer.refused else answer.reason
@@ -28,7 +33,24 @@ def camera_finding(backend: str, answer: tuple[SeenCamera, ...] | Failure, asked
     troubles = "\n".join(f"{camera.name}: {camera.trouble}" for camera in answer if camera.trouble)
     if all(camera.trouble for camera in answer):
         return Finding(topic, Status.NOTE, f"{found}; cannot be opened", troubles).needed(asked)
+    wrong = _not_the_one(answer, serial) if asked else ""
+    if wrong:
+        return Finding(topic, Status.PROBLEM, found, wrong)
     return Finding(topic, Status.OK, found, troubles)
+
+
+def _not_the_one(answer: tuple[SeenCamera, ...], serial: str | None) -> str:
+    """Say why none of the cameras can be opened as the one that is wanted; empty where one can."""
+    if serial is None:
+        several = f"Expected one camera, found {len(answer)}. Choose one with --serial."
+        return several if len(answer) > 1 else ""
+    wanted = [camera for camera in answer if camera.serial == serial]
+    # A serial number that this user may not read may be the wanted one.
+    hidden = [camera for camera in answer if camera.trouble and not camera.serial]
+    if not wanted and not hidden:
+        found = ", ".join(camera.serial or "one without a number" for camera in answer)
+        return f"Expected a camera of the serial number {serial}, found {found}. Plug it in, or correct --serial."
+    return next((f"{camera.name}: {camera.trouble}" for camera in wanted or hidden if camera.trouble), "")
 
 
 def rig_finding(rig: RigDescription, answer: OpenedCamera | Failure) -> Finding:

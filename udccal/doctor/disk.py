@@ -11,6 +11,7 @@ from udccal.doctor.finding import Finding, Status
 from udccal.doctor.session_size import captured_bytes, session_bytes
 from udccal.errors import SessionError
 from udccal.rig import RigDescription
+from udccal.sessions.changes import check_description
 from udccal.sessions.manifest import MANIFEST_NAME, read_manifest
 from udccal.sessions.schema import Manifest
 
@@ -33,6 +34,12 @@ def disk_finding(session: Path | None, rig: RigDescription | None, free: Callabl
         manifest = read_manifest(place) if (place / MANIFEST_NAME).is_file() else None
     except SessionError as error:
         return Finding(_TOPIC, Status.PROBLEM, f"the session in {place} cannot be read", str(error))
+    try:
+        if manifest is not None and rig is not None:
+            check_description(place, manifest, rig)
+    except SessionError as error:
+        found = f"the session in {place} is of another rig, or of one that is described differently"
+        return Finding(_TOPIC, Status.PROBLEM, found, str(error))
     described = rig or (manifest.rig if manifest else None)
     available = free(folder)
     found = f"{_size(available)} free in {folder.resolve()}"

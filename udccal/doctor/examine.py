@@ -50,11 +50,11 @@ def examine(wanted: Wanted) -> tuple[Finding, ...]:
     with ThreadPoolExecutor() as pool:
         u3v = pool.submit(ask, Question.U3V, read_cameras, cameras.ASK_S)
         jax = pool.submit(ask, Question.JAX, read_devices, accelerators.ASK_JAX_S)
-        pylon = pool.submit(_pylon, wanted.camera == Question.PYLON)
+        pylon = pool.submit(_pylon, wanted.camera == Question.PYLON, wanted.serial)
         monitors = pool.submit(monitor_finding, _panel_size(wanted.rig), wanted.monitor)
         gpu = accelerators.gpu_finding()
         seen = (
-            cameras.camera_finding(Question.U3V, u3v.result(), wanted.camera == Question.U3V),
+            cameras.camera_finding(Question.U3V, u3v.result(), wanted.camera == Question.U3V, wanted.serial),
             *pylon.result(),
         )
         return (
@@ -70,12 +70,12 @@ def examine(wanted: Wanted) -> tuple[Finding, ...]:
         )
 
 
-def _pylon(asked: bool) -> tuple[Finding, ...]:
+def _pylon(asked: bool, serial: str | None) -> tuple[Finding, ...]:
     sdk = cameras.pylon_sdk_finding(asked)
     if sdk.status is not Status.OK:
         return (sdk,)
     answer = ask(Question.PYLON, read_cameras, cameras.ASK_S)
-    return sdk, cameras.camera_finding(Question.PYLON, answer, asked)
+    return sdk, cameras.camera_finding(Question.PYLON, answer, asked, serial)
 
 
 def _against_rig(wanted: Wanted, seen: tuple[Finding, ...]) -> tuple[Finding, ...]:

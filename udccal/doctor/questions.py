@@ -57,6 +57,7 @@ def _u3v_cameras() -> list[SeenCamera]:
             name=_name(device.identity),
             too_slow=device.super_speed and UsbSpeed.UNKNOWN < device.speed < UsbSpeed.SUPER,
             trouble=device.trouble or "",
+            serial=device.identity.serial,
         )
         for device in found_devices()
     ]
@@ -65,7 +66,7 @@ def _u3v_cameras() -> list[SeenCamera]:
 def _pylon_cameras() -> list[SeenCamera]:
     from udccal.cameras.pylon import list_cameras
 
-    return [SeenCamera(_name(identity)) for identity in list_cameras()]
+    return [SeenCamera(_name(identity), serial=identity.serial) for identity in list_cameras()]
 
 
 def _opened(camera: Camera, cfa: str, bits: int) -> list[OpenedCamera]:

@@ -53,11 +53,7 @@ def admit(
         SessionError: when the rig differs, camera or lens differ and that was not accepted, or parts were exchanged
             too often.
     """
-    if rig.model_copy(update={"lens": manifest.rig.lens}) != manifest.rig:
-        raise SessionError(
-            f"Expected the session {path} to be of the rig '{rig.name}' as it is described now, found another "
-            f"description ('{manifest.rig.name}'). Begin a new session."
-        )
+    check_description(path, manifest, rig)
     changes = tuple(_changes(manifest, rig, camera))
     for change in changes:
         if Exchanged(change.what) not in accepted:
@@ -74,6 +70,19 @@ def admit(
         )
     update = {"rig": rig, "camera": stored_camera(camera), "changes": (*manifest.changes, *changes)}
     return manifest.model_copy(update=update)
+
+
+def check_description(path: Path, manifest: Manifest, rig: RigDescription) -> None:
+    """Refuse a session of a rig that is described in another way; its lens alone may differ.
+
+    Raises:
+        SessionError: when the rig differs.
+    """
+    if rig.model_copy(update={"lens": manifest.rig.lens}) != manifest.rig:
+        raise SessionError(
+            f"Expected the session {path} to be of the rig '{rig.name}' as it is described now, found another "
+            f"description ('{manifest.rig.name}'). Begin a new session."
+        )
 
 
 def _changes(manifest: Manifest, rig: RigDescription, camera: CameraIdentity) -> Iterator[StoredChange]:
