@@ -9,11 +9,13 @@ import pytest
 
 from procedures.plans import Bracket, Fixed, Metered, Singles, Stack, TimesThatOf
 from tests.procedures.benches import new_writer, simulated_bench, small_rig
+from udccal.benches.capture import TERMS
 from udccal.errors import UdccalError
 from udccal.guide.capture import guided_steps
 from udccal.planning import steps
 from udccal.planning.state import nominal_state
 from udccal.plugins import find_procedure
+from udccal.rig import load_rig
 from udccal.sessions.schema import TermName
 
 
@@ -31,10 +33,21 @@ def test_frames_are_those_of_a_session(term: TermName, tmp_path: Path) -> None:
     assert cost.frames == pytest.approx(taken, rel=0.25)
 
 
-@pytest.mark.parametrize("term", ["noise", "wire", "backscatter"])
+@pytest.mark.parametrize("term", TERMS)
 def test_set_ups_are_those_that_a_person_is_led_through(term: TermName) -> None:
     rig = small_rig()
     assert nominal_state(rig).cost(term).set_ups == len(guided_steps(rig, [term]))
+
+
+def test_further_shifts_and_views_ask_for_no_further_set_up() -> None:
+    state = nominal_state(load_rig("lg55-aca2040"))
+    assert sum(state.cost(term).set_ups for term in TERMS) == 42
+    captures = state.rig.captures
+    more = state.with_captures(
+        captures.model_copy(update={"psf_shifts": captures.psf_shifts + 1, "board_views": captures.board_views + 1})
+    )
+    for term in TERMS:
+        assert more.cost(term).set_ups == state.cost(term).set_ups
 
 
 def test_no_frame_is_quicker_than_its_exposure_or_the_camera() -> None:

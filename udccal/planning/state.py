@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import groupby
 from typing import Any, final
 
 import jax
@@ -22,6 +21,7 @@ from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
 from udccal.planned_steps import with_small_panel
 from udccal.planning.steps import PANEL_FULL_S, Cost, PlannedStep, steps_at
+from udccal.plugins import find_procedure
 from udccal.result import FitResult, FitStatus, TermResults
 from udccal.rig import Captures, RigDescription
 from udccal.sessions.schema import TermName
@@ -91,8 +91,8 @@ class RigState:
         """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``steps_at``."""
         steps, period_s = self.steps(term), 1.0 / self.rig.camera.frame_rate_hz
         exposures_s = [one for step in steps for one in (*step.exposures_s, *step.exposures_s[:1] * step.test_frames)]
-        # A person is asked when the instruction changes; pictures of the panel follow each other by themselves.
-        set_ups = sum(1 for _ in groupby(steps, key=lambda step: step.instruction))
+        # Steps that a person is led through: all shifts in a cell are one, and so are all views held by hand.
+        set_ups = sum(1 for _ in find_procedure(term)().guided(self.rig))
         return Cost(len(exposures_s), sum(max(period_s, one) for one in exposures_s), set_ups)
 
     @property
