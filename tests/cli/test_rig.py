@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from udccal.cli.jobs.rigs import new_rig
+from udccal.cli.jobs.rigs import list_rigs, new_rig
 from udccal.cli.output import Output
 from udccal.errors import RigError
 from udccal.rig import load_rig
@@ -87,6 +88,26 @@ def test_a_wrong_description_is_told_of_all_its_mistakes(rigs: Path) -> None:
     assert "longer than the longest" in refused("rig", "check", "lobby")
     file.write_text(good.replace("columns = 2048", "columns = 2047"), encoding="utf-8")
     assert "Give 2046 x 1536" in refused("rig", "check", "lobby")
+
+
+def test_a_description_that_cannot_be_read_is_listed_with_the_others(
+    rigs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("lobby", "entrance"):
+        new_rig(Output(as_json=True), name, "lg55-reduced")
+    capsys.readouterr()
+    read = Path.read_bytes
+
+    def read_but_one(path: Path) -> bytes:
+        if path.parent.name == "lobby":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_but_one)
+    list_rigs(Output(as_json=True))
+    listed = {rig["name"]: rig["problem"] for rig in json.loads(capsys.readouterr().out)["rigs"]}
+    assert {name for name, problem in listed.items() if problem} == {"lobby"}
+    assert f"Expected to read {rigs / 'lobby' / 'rig.toml'}, found: Permission denied." in listed["lobby"]
 
 
 def test_a_wrong_name_is_told_the_nearest_and_the_own_rigs(rigs: Path) -> None:
