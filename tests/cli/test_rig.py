@@ -12,7 +12,7 @@ import pytest
 
 from udccal.cli.jobs.rigs import list_rigs, new_rig
 from udccal.cli.output import Output
-from udccal.errors import RigError
+from udccal.errors import RigError, UdccalError
 from udccal.rig import load_rig
 from udccal.rig_folders import shipped_rig_folder
 
@@ -72,6 +72,25 @@ def test_names_that_are_taken_or_none_are_refused(rigs: Path) -> None:
     assert "found none for 'strange'" in refused("rig", "new", "other", "--like", "strange")
     assert (rigs / "lobby" / "rig.toml").read_bytes() == before
     assert [path.name for path in rigs.iterdir()] == ["lobby"]
+
+
+def test_a_folder_without_a_description_is_no_rig(rigs: Path) -> None:
+    (rigs / "lobby").mkdir(parents=True)
+    new_rig(Output(as_json=True), "lobby", "lg55-reduced")
+    assert load_rig("lobby").name == "lobby"
+
+
+def test_a_rig_that_cannot_be_written_leaves_no_folder(rigs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("udccal.cli.jobs.rigs.write_atomically", full)
+    (rigs / "entrance").mkdir(parents=True)
+    for name in ("lobby", "entrance"):
+        with pytest.raises(UdccalError, match="No space left"):
+            new_rig(Output(as_json=True), name, "lg55-reduced")
+    # What was there before stays.
+    assert [path.name for path in rigs.iterdir()] == ["entrance"]
 
 
 def test_a_wrong_description_is_told_of_all_its_mistakes(rigs: Path) -> None:

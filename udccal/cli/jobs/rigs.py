@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,13 +102,13 @@ def new_rig(output: Output, name: str, like: str) -> None:
     if own is None:
         raise RigError("Expected a folder for your own rigs, found no home folder. Name one with UDCCAL_RIGS.")
     folder = own / name
-    if folder.exists() or name in rig_names(shipped_rig_folder()):
+    # A folder without a description is no rig: every other verb says that there is none of its name.
+    if os.path.lexists(folder / RIG_FILE) or name in rig_names(shipped_rig_folder()):
         raise RigError(f"Expected a name that is free, found that there is a rig '{name}'. Choose another name.")
     load_rig(like)
     text = (find_rig(like) / RIG_FILE).read_text(encoding="utf-8")
     with storing_in(folder):
-        folder.mkdir(parents=True)
-        write_atomically(folder / RIG_FILE, _NAME_LINE.sub(f'name = "{name}"', text, count=1).encode("utf-8"))
+        _write_new(folder, _NAME_LINE.sub(f'name = "{name}"', text, count=1))
     output.say(f"Edit {folder / RIG_FILE}: its numbers are those of {like}. Then: udccal rig check {name}")
     output.result(NewRig(name, like, folder / RIG_FILE))
 
@@ -150,6 +152,19 @@ def consequences(rig: RigDescription) -> tuple[Consequence, ...]:
         Consequence("level of a full pixel", brightest_DN, "DN"),
         Consequence("end of the converter", float(rig.saturation_DN), "DN"),
     )
+
+
+def _write_new(folder: Path, text: str) -> None:
+    """Write a description to a folder; one that was made for it does not stay without it."""
+    there = folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        write_atomically(folder / RIG_FILE, text.encode("utf-8"))
+    except BaseException:
+        if not there:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def _known(folder: Path, own: bool) -> KnownRig:
