@@ -276,6 +276,19 @@ def test_profiles_are_found_by_path_and_by_name(
     assert find_profile("mine") == mine / RIG_PROFILE
 
 
+def test_a_folder_named_as_a_rig_does_not_hide_its_profile(
+    tmp_path: Path, stored: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in the folder of all rigs."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lg55-reduced").mkdir()
+    shipped = shipped_rig_folder() / "lg55-reduced" / RIG_PROFILE
+    assert find_profile("lg55-reduced") == shipped
+    shutil.rmtree("lg55-reduced")
+    shutil.copytree(stored, "lg55-reduced")
+    assert find_profile("lg55-reduced") == Path("lg55-reduced")
+
+
 def test_the_shipped_profile_is_of_the_shipped_rig() -> None:
     profile = read_profile(find_profile("lg55-reduced"))
     assert profile.rig == load_rig("lg55-reduced")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -111,14 +112,16 @@ def find_profile(name_or_path: str | Path) -> Path:
     """Return the path of a profile.
 
     Args:
-        name_or_path: a path, or the name of a rig whose folder holds a profile as ``profile``. An existing path is
-            preferred.
+        name_or_path: a path, or the name of a rig whose folder holds a profile as ``profile``. A path that holds a
+            profile is preferred, and so is any file.
 
     Returns:
         the path as given when nothing is found, so that reading it gives the error.
     """
     path = Path(name_or_path)
-    if standing(path).exists():
+    place = standing(path)
+    # A folder of that name that is no profile, as a rig's own, does not hide the rig's profile.
+    if place.is_file() or os.path.lexists(place / PROFILE_NAME):
         return path
     try:
         of_rig = find_rig(name_or_path) / RIG_PROFILE
