@@ -48,6 +48,32 @@ def test_packed_and_unpacked_it_is_the_same_to_the_byte(folder: Path) -> None:
     assert sorted(item.name for item in folder.parent.iterdir()) == ["again.zip", "p", "p.zip", "q"]
 
 
+def damaged_zip(packed: Path, name: str) -> Path:
+    """A zip file of a profile with other content in the file of that name."""
+    with zipfile.ZipFile(packed) as archive:
+        files = {file: archive.read(file) for file in archive.namelist()}
+    with zipfile.ZipFile(packed, "w") as archive:
+        for file, content in files.items():
+            archive.writestr(file, b'{"format": "another"}' if file == name else content)
+    return packed
+
+
+@pytest.mark.parametrize("name", [PROFILE_NAME, "wire_map.exr"])
+def test_a_refused_zip_file_is_named_by_its_path(folder: Path, name: str) -> None:
+    packed = folder.with_name("p.zip")
+    pack_profile(folder, packed)
+    damaged_zip(packed, name)
+    uses = (
+        read_profile,
+        lambda path: unpack_profile(path, path.with_name("q")),
+        lambda path: pack_profile(path, path.with_name("r.zip")),
+    )
+    for use in uses:
+        with pytest.raises(ProfileError) as refused:
+            use(packed)
+        assert f"Expected {packed / name} to have" in str(refused.value)
+
+
 def test_a_copy_takes_the_place_of_a_profile_and_of_nothing_else(folder: Path) -> None:
     packed, taken, mine = folder.with_name("p.zip"), folder.with_name("q"), folder.with_name("mine.zip")
     pack_profile(folder, packed)

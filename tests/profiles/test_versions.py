@@ -41,6 +41,13 @@ def test_a_version_must_be_a_number(version: object) -> None:
         migrated({"format": "udccal-profile", "version": version}, "p")
 
 
+@pytest.mark.parametrize("version", [10**4000, "1" * 4000])
+def test_a_long_version_is_shortened(version: object) -> None:
+    with pytest.raises(ProfileError, match="version") as refused:
+        migrated({"format": "udccal-profile", "version": version}, "p")
+    assert len(str(refused.value)) < 200
+
+
 def test_newer_and_forgotten_versions_are_refused() -> None:
     with pytest.raises(ProfileError, match="newer version 4"):
         migrated({"format": "udccal-profile", "version": 4}, "p", {}, target=3)

@@ -73,7 +73,21 @@ def unpacked(path: Path, only: str | None = None) -> Iterator[Path]:
         )
     with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
         unpack_archive(path, Path(folder), only)
-        yield Path(folder)
+        with naming(path, Path(folder)):
+            yield Path(folder)
+
+
+@contextmanager
+def naming(path: Path, folder: Path) -> Iterator[None]:
+    """Name ``path`` in errors about a temporary folder of its files: a person has never seen that, and it is deleted.
+
+    Raises:
+        ProfileError: with the other name.
+    """
+    try:
+        yield
+    except ProfileError as error:
+        raise ProfileError(str(error).replace(str(folder), str(path))) from error
 
 
 def unpack_archive(path: Path, folder: Path, only: str | None = None) -> None:

@@ -11,7 +11,7 @@ from udccal.errors import ProfileError
 from udccal.io.links import is_plain_file
 from udccal.io.reading import reading
 from udccal.io.whole_folder import folder_beside, read_standing
-from udccal.profiles.archive import unpacked
+from udccal.profiles.archive import naming, unpacked
 from udccal.profiles.arrays import MAX_FILE_BYTES
 from udccal.profiles.encode import decode
 from udccal.profiles.history import identity
@@ -99,7 +99,8 @@ def _copy_standing(source: Path, target: Path) -> None:
             with (copy / name).open("wb") as stream:
                 for piece in _pieces(file):
                     stream.write(piece)
-        decode(read_stored(copy), copy)
+        with naming(source, copy):
+            decode(read_stored(copy), copy)
         put(copy, target)
 
 

@@ -6,6 +6,7 @@ previous version to the new one. Each function is kept for good, with a stored p
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -169,11 +170,14 @@ def migrated(
     if found.get("format") != FORMAT:
         raise ProfileError(f"Expected {where} to have the format '{FORMAT}', found another. Check the path.")
     version = found.get("version")
+    found_version = reprlib.repr(version)
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise ProfileError(f"Expected a version number from 1 in {where}, found {version!r}. Restore it from a copy.")
+        raise ProfileError(
+            f"Expected a version number from 1 in {where}, found {found_version}. Restore it from a copy."
+        )
     if version > target:
         raise ProfileError(
-            f"Expected {where} to have at most version {target}, found the newer version {version}. "
+            f"Expected {where} to have at most version {target}, found the newer version {found_version}. "
             "Update udccal to read it."
         )
     while version < target:
