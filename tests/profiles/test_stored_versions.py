@@ -20,6 +20,7 @@ import pytest
 from tests.profiles.test_store import TERMS, assert_same
 from udccal.errors import ProfileError
 from udccal.profiles.copies import migrate_profile
+from udccal.profiles.history import history
 from udccal.profiles.profile import Profile
 from udccal.profiles.schema import VERSION
 from udccal.profiles.store import read_profile, write_profile
@@ -70,6 +71,14 @@ def test_every_number_survives(document: JsonObject, profile: Profile) -> None:
                 np.testing.assert_array_equal(at(profile.result(name).term, one["name"]), value, one["name"])
                 compared += 1
     assert compared >= 50
+
+
+def test_a_migration_changes_no_term(version: int, tmp_path: Path) -> None:
+    old = tmp_path / "old.zip"
+    old.write_bytes(STORED[version].read_bytes())
+    migrate_profile(old, tmp_path / "new")
+    newest, _ = history(tmp_path / "new")
+    assert newest.changed == ()
 
 
 def test_every_fit_survives(document: JsonObject, profile: Profile) -> None:

@@ -133,8 +133,9 @@ def _past(read: _Read, before: _Read | None) -> PastProfile:
 
 
 def _numbers(section: Section) -> tuple[object, ...]:
-    """What a refit changes of a term; notes are added to kept ones, too."""
-    return section.parameters, section.arrays, section.fit.estimates
+    """What a refit changes of a term; notes are added to kept ones, too, and a migration words estimates anew."""
+    unworded = tuple(one.model_copy(update={"what": ""}) for one in section.fit.estimates)
+    return section.parameters, section.arrays, unworded
 
 
 def _beside(path: Path) -> dict[str, Path]:
