@@ -62,6 +62,7 @@ def test_an_exported_lens_is_imported(folder: Path) -> None:
         assert exported["not_held"]
     shown = profile("show", folder / "p")
     assert [term["status"] for term in shown["terms"]] == ["NOT_CAPTURED", "IMPORTED", *["NOT_CAPTURED"] * 3]
+    assert {one["name"]: one["value"] for one in shown["imported"]}.items() >= {"fx": 80.5, "fy": 81.0}.items()
 
 
 def test_what_cannot_be_done_is_a_sentence(folder: Path, toy_profile: Profile) -> None:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from udccal.comparison.estimates import ANGLES
 from udccal.comparison.limits import DiffLimits
 from udccal.comparison.rig_state import RigState
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES
+from udccal.models.geometry import Geometry
+from udccal.mounting import angles_deg
 from udccal.quantities import quantity
 from udccal.reports.tables import Table, number, spread
-from udccal.result import Estimate, FitResult
+from udccal.result import Estimate, FitResult, FitStatus
 
 MOST_ORDERS, MOST_CHOICES = 6, 16
 _NUMBERS = frozenset({1, 2})
@@ -22,6 +28,25 @@ def estimates_table(title: str, result: FitResult) -> Table:
         for e in result.numbers
     )
     return Table(title, ("quantity", "value", "sigma", "unit", "before the data", "name"), rows, _NUMBERS)
+
+
+def imported_numbers(result: FitResult) -> dict[str, float]:
+    """Return a lens from another program's file under the names of a fit's estimates; empty for any other result.
+
+    It has no estimates, since nobody knows its error bars.
+    """
+    lens = result.term
+    if result.status is not FitStatus.IMPORTED or not isinstance(lens, Geometry):
+        return {}
+    values = (lens.focal_px, lens.principal_point_px, lens.distortion, angles_deg(np.asarray(lens.rotation_rad)))
+    return dict(zip((*INTRINSIC_NAMES, *ANGLES), np.concatenate(values).tolist(), strict=True))
+
+
+def imported_table(title: str, result: FitResult) -> Table:
+    """Return a table with ``title`` of the numbers of an imported lens."""
+    told = [(quantity(result.name, name), name, value) for name, value in imported_numbers(result).items()]
+    rows = tuple((q.plain, f"{value:.6g}", q.unit, name) for q, name, value in told)
+    return Table(title, ("quantity", "value", "unit", "name"), rows, frozenset({1}))
 
 
 def meanings_table(result: FitResult) -> Table:
@@ -44,7 +69,7 @@ def state_table(state: RigState) -> Table:
 
 def captures_sentence(result: FitResult) -> str:
     """Return what a fit used, as far as it is known; empty for a term that was not fitted."""
-    if result.unfitted:
+    if result.unfitted or result.status is FitStatus.IMPORTED:
         return ""
     used = result.captures
     if used is None:

@@ -12,6 +12,8 @@ import pytest
 from tests.profiles.exchange.conftest import LENS
 from tests.profiles.exchange.test_ros_camera_info import CALIBRATOR
 from tests.profiles.test_store import assert_same
+from udccal.cli.jobs.show import show_profile
+from udccal.cli.output import Output
 from udccal.cli.profile import ExportTo, ImportFrom
 from udccal.errors import ProfileError
 from udccal.profiles.exchange.exports import EXPORTS, export_profile
@@ -38,6 +40,20 @@ def test_a_lens_becomes_a_whole_profile(tmp_path: Path, toy_rig: RigDescription)
     write_profile(tmp_path / "p", made)
     assert_same(read_profile(tmp_path / "p"), made)
     assert not made.warnings
+
+
+@pytest.mark.medium
+def test_an_imported_lens_is_shown(tmp_path: Path, toy_rig: RigDescription, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "camera.yaml").write_text(CALIBRATOR)
+    made = profile_of(read_lens(tmp_path / "camera.yaml", IMPORTS["ros-camera-info"]), toy_rig, "camera.yaml")
+    write_profile(tmp_path / "p", made)
+    show_profile(Output(), tmp_path / "p")
+    said = " ".join("".join(capsys.readouterr()).replace("│", " ").split())
+    assert "Imported from camera.yaml" in said
+    for number in ("focal length, x 80.5 px fx", "focal length, y 81 px fy", "distortion, radial 3"):
+        assert number in said
+    # Nothing was fitted.
+    assert "fit used" not in said
 
 
 def test_the_pose_is_taken_where_it_is_udccals(tmp_path: Path, profile: Profile) -> None:

@@ -10,7 +10,7 @@ from udccal.cli.output import Output
 from udccal.comparison.rig_state import rig_state
 from udccal.profiles.store import load_profile
 from udccal.quantities import quantity
-from udccal.reports.fit_tables import captures_sentence, estimates_table, state_table
+from udccal.reports.fit_tables import captures_sentence, estimates_table, imported_numbers, imported_table, state_table
 from udccal.result import Captures, Effort, Estimate, EstimatePrior, Outliers
 from udccal.sessions.schema import TermName
 
@@ -27,6 +27,17 @@ class ShownEstimate:
     what: str
     prior: EstimatePrior | None
     by_prior: bool
+
+
+@dataclass(frozen=True)
+class ShownNumber:
+    """One quantity of a term that was imported: nobody knows its sigma."""
+
+    term: str
+    name: str
+    value: float
+    unit: str
+    what: str
 
 
 @dataclass(frozen=True)
@@ -63,6 +74,7 @@ class ProfileSummary:
     created_at: str
     terms: tuple[ShownTerm, ...]
     estimates: tuple[ShownEstimate, ...]
+    imported: tuple[ShownNumber, ...]
     rig_state: ShownState
     warnings: tuple[str, ...]
     invalidated_by: tuple[str, ...]
@@ -82,7 +94,8 @@ def show_profile(output: Output, path: Path) -> None:
     results = [(term, profile.result(term)) for term in get_args(TermName)]
     output.say(f"Profile of {profile.rig.name}, made {profile.provenance.created_at}")
     for term, result in results:
-        output.table(estimates_table(f"{term}: {result.status.name.lower().replace('_', ' ')}", result))
+        table = imported_table if imported_numbers(result) else estimates_table
+        output.table(table(f"{term}: {result.status.name.lower().replace('_', ' ')}", result))
         if result.unfitted:
             output.say(f"{term}: {result.status.value}")
         for sentence in filter(None, (*result.notes, captures_sentence(result), result.warning)):
@@ -100,6 +113,7 @@ def show_profile(output: Output, path: Path) -> None:
                 for term, r in results
             ),
             estimates=tuple(_shown(term, e) for term, r in results for e in r.numbers),
+            imported=tuple(_imported(term, *item) for term, r in results for item in imported_numbers(r).items()),
             rig_state=ShownState(
                 estimates=tuple(_shown("rig", e) for e in state.estimates),
                 covariance=tuple(tuple(row) for row in state.cov.tolist()),
@@ -117,3 +131,8 @@ def show_profile(output: Output, path: Path) -> None:
 def _shown(term: str, one: Estimate) -> ShownEstimate:
     what = quantity(term, one.name).what
     return ShownEstimate(term, one.name, one.value, one.sigma, one.unit, what, one.prior, one.by_prior)
+
+
+def _imported(term: str, name: str, value: float) -> ShownNumber:
+    known = quantity(term, name)
+    return ShownNumber(term, name, value, known.unit, known.what)
