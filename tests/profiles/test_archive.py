@@ -141,14 +141,17 @@ def test_files_from_before_1980_are_packed(tmp_path: Path, target: Path) -> None
     assert (target / "profile.json").read_text() == "{}"
 
 
+@pytest.mark.parametrize(
+    ("reason", "advice"), [(errno.ENOSPC, "Free some space there"), (errno.EFBIG, "Allow larger files there")]
+)
 def test_a_full_disk_is_not_taken_for_a_damaged_file(
-    tmp_path: Path, target: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, target: Path, monkeypatch: pytest.MonkeyPatch, reason: int, advice: str
 ) -> None:
     path = archive_with(tmp_path / "p.zip", "profile.json")
 
     def full(*arguments: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise OSError(reason, os.strerror(reason))
 
     monkeypatch.setattr("udccal.profiles.archive._unpack_entry", full)
-    with pytest.raises(ProfileError, match=r"found: No space left on device\. Free some space there"):
+    with pytest.raises(ProfileError, match=rf"found: {os.strerror(reason)}\. {advice}"):
         unpack_archive(path, target)

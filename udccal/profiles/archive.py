@@ -39,7 +39,12 @@ _DAMAGES = (
     RuntimeError,
     ValueError,
 )
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+# What to do about a file that cannot be written, by the reason.
+_NO_ROOM = {
+    errno.ENOSPC: "Free some space there",
+    errno.EDQUOT: "Free some space there",
+    errno.EFBIG: "Allow larger files there (ulimit -f)",
+}
 _UNREADABLE = (errno.EACCES, errno.EPERM, errno.EIO)
 
 
@@ -107,8 +112,8 @@ def unpack_archive(path: Path, folder: Path, only: str | None = None) -> None:
     except _DAMAGES as error:
         if isinstance(error, OSError) and error.errno in _NO_ROOM:
             raise ProfileError(
-                f"Expected room to unpack {path} into {folder}, found: {error.strerror}. Free some space there, or set "
-                "TMPDIR to a folder on another disk."
+                f"Expected room to unpack {path} into {folder}, found: {error.strerror}. {_NO_ROOM[error.errno]}, or "
+                "set TMPDIR to a folder on another disk."
             ) from error
         if isinstance(error, OSError) and error.errno in _UNREADABLE:
             raise ProfileError(
