@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import ErrorDetails
 
 from udccal.errors import RigError
+from udccal.io.reading import reading
 from udccal.rig_folders import RIG_FILE, find_rig
 from udccal.rig_versions import present_rig
 
@@ -203,7 +204,8 @@ def load_rig(name_or_path: str | Path) -> RigDescription:
         RigError: when there is no such rig, the file is not TOML, or a value is missing, unknown or out of range.
     """
     file = find_rig(name_or_path) / RIG_FILE
-    raw = file.read_bytes()
+    with reading(file, RigError):
+        raw = file.read_bytes()
     if len(raw) > _MAX_TOML_BYTES:
         raise RigError(f"Expected {file} to hold at most {_MAX_TOML_BYTES} bytes, found {len(raw)}. Shorten it.")
     try:

@@ -187,6 +187,8 @@ def test_an_exposure_must_be_positive(restorer: Restorer, frame: np.ndarray, exp
         restorer.restore(frame, exposure_s)
     with pytest.raises(RestorationError, match="positive exposure"):
         restorer.before(frame, exposure_s)
+    with pytest.raises(RestorationError, match="positive exposure"):
+        restorer.display(frame, exposure_s, Tone(1e-5))
 
 
 def test_panel_pictures_of_another_panel_are_refused(toy_rig: RigDescription) -> None:

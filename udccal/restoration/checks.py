@@ -94,7 +94,7 @@ def check_frame(mosaic: object, exposure_s: object, rig: RigDescription) -> None
     if not isinstance(mosaic, np.ndarray) or mosaic.dtype != np.uint16 or mosaic.ndim != 2:
         raise RestorationError(
             f"Expected a mosaic of 16-bit samples, rows x columns of uint16, found {found_instead(mosaic)}. "
-            "Give the raw frame."
+            "Give the raw frame; one of another byte order by .astype(np.uint16)."
         )
     if mosaic.shape != (camera.rows, camera.columns):
         raise RestorationError(

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
+from udccal.errors import RestorationError
 from udccal.kernels import fitted_size
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
@@ -23,7 +24,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
 from udccal.restoration.blind import BlindSamples
-from udccal.restoration.checks import check_frame, check_panel_picture
+from udccal.restoration.checks import check_exposure, check_frame, check_panel_picture
 from udccal.restoration.dark_places import plausible
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
@@ -282,6 +283,9 @@ class Restorer:
         Raises:
             RestorationError: as ``restore``.
         """
+        check_exposure(exposure_s)
+        if not isinstance(tone, Tone):
+            raise RestorationError(f"Expected a Tone, found {tone!r:.80}. Give Tone(display_exposure(picture)), say.")
         if self.tier is not Tier.preview:
             of_e = replace(tone, exposure=tone.exposure / exposure_s)
             return of_e.rgb8(self._restored_e(mosaic, exposure_s, panel_picture))

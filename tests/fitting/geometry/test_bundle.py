@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
@@ -12,7 +14,9 @@ from udccal.board.charuco import board_points_mm
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.geometry.calibrated import CalibratedViews
+from udccal.fitting.geometry.data import gather
 from udccal.fitting.geometry.fit import fit_geometry, projection_sigma_px
+from udccal.fitting.geometry.views import check_picture
 from udccal.models.geometry import Geometry
 from udccal.result import FitStatus
 
@@ -200,3 +204,41 @@ def test_too_few_arrays_have_a_status_and_arrays_of_other_numbers_an_error() -> 
     assert "3 views" in found.notes[0]
     with pytest.raises(FitError, match="as many views"):
         fit_geometry(board[:2], image, SCENE.size)
+
+
+def test_views_need_no_common_corner() -> None:
+    board, image, sigma = arrays()
+    half = board[0][:, 0] < np.median(board[0][:, 0])
+    for view, kept in ((0, half), (1, ~half)):
+        image[view][~kept] = np.nan
+    found = calibrated(board, image, SCENE.size, sigmas=sigma)
+    assert found.status is FitStatus.CONVERGED
+    assert np.abs(errors(found)).max() < 4
+
+
+@pytest.mark.parametrize("size", [(0, 0), (-320, -240), (320.0, 240.0), (320, 240, 3), None, 320, "320x240"])
+def test_a_size_that_no_picture_has_is_refused(size: object) -> None:
+    board, image, _ = arrays()
+    with pytest.raises(FitError, match="two whole numbers, found"):
+        check_picture(size, gather(board, image).points)
+
+
+def test_rows_and_columns_exchanged_are_refused() -> None:
+    board, image, _ = arrays()
+    with pytest.raises(FitError, match="Expected corners within the picture"):
+        fit_geometry(board, [points[:, ::-1] for points in image], SCENE.size)
+
+
+def test_points_in_the_order_of_another_board_have_no_error_bars() -> None:
+    board, image, _ = arrays()
+    turned = replace(SCENE.spec, columns=SCENE.spec.rows, rows=SCENE.spec.columns)
+    found = fit_geometry([board_points_mm(turned)] * len(board), image, SCENE.size)
+    assert not found.usable
+    assert "order of the board's" in found.notes[0]
+
+
+def test_a_pixel_on_which_no_ray_lands_has_no_sigma() -> None:
+    found = fit_geometry(*arrays()[:2], SCENE.size)
+    with pytest.raises(FitError, match="distortion folds"):
+        projection_sigma_px(found, np.array([[1e5, 1e5]]))
+    assert np.isfinite(projection_sigma_px(found, np.array([[160.0, 120.0]]))).all()

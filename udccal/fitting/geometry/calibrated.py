@@ -136,11 +136,7 @@ class CalibratedViews:
         near = np.abs(places - pixels).max(axis=1) < 1e-6
         lost = ~near | (np.linalg.det(np.where(near[:, None, None], by[:, :, LENS + 3 : LENS + 5], 0.0)) <= 0)
         if lost.any():
-            x, y = pixels[lost][0]
-            raise FitError(
-                f"Expected pixels that a ray lands on, found ({x:g}, {y:g}) and {int(lost.sum()) - 1} more where the "
-                "fitted distortion folds. Ask within the corners that were seen, or capture boards at the edges."
-            )
+            raise FitError(folded(pixels[lost]))
         return by[:, :, :LENS], by[:, :, LENS : LENS + 3]
 
 
@@ -228,6 +224,15 @@ def _pattern(
     # Mean over the points of the squared mean of their cell, less the part that noise has in it.
     excess = float(((sums**2 - np.diag(expected)) / count).sum() / count.sum())
     return found, float(np.sqrt(max(excess, 0.0) * np.mean(points.sigma[points.used] ** 2)))
+
+
+def folded(pixels: Float[np.ndarray, "n 2"]) -> str:
+    """What is told of pixels on which no ray lands."""
+    x, y = pixels[0]
+    return (
+        f"Expected pixels that a ray lands on, found ({x:g}, {y:g}) and {len(pixels) - 1} more where the fitted "
+        "distortion folds. Ask within the corners that were seen, or capture boards at the edges."
+    )
 
 
 def status_of(

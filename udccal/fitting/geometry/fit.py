@@ -21,9 +21,9 @@ from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, USUAL, GeometryRules, Intrinsics
-from udccal.fitting.geometry.calibrated import CalibratedViews, turn_with
+from udccal.fitting.geometry.calibrated import CalibratedViews, folded, turn_with
 from udccal.fitting.geometry.data import BoardView, GeometryData, gather
-from udccal.fitting.geometry.views import calibrate_views
+from udccal.fitting.geometry.views import calibrate_views, check_picture
 from udccal.models.geometry import Geometry, panel_directions, project_directions
 from udccal.mounting import angles_deg, turned_by
 from udccal.numerics import in_float64
@@ -32,6 +32,8 @@ from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 # Scatter in addition to noise of the board on the jig, and of the median other view: a plan reads them.
 ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
 _NAMES = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg")
+# Between a pixel and the place where the direction seen there appears: rounding, where the distortion does not fold.
+_ROUNDING_PX = 0.05
 
 
 def fit_geometry(
@@ -68,11 +70,15 @@ def fit_geometry(
         FitError: when the arrays do not belong together.
     """
     gathered = gather(board_points, image_points, sigmas, rules)
+    check_picture(image_size, gathered.points)
+    lens = start or Intrinsics.centred(float(max(image_size)), image_size).camera()
     try:
         views = calibrate_views(gathered, image_size, start, prior, rules=rules)
     except FitError as error:
-        lens = start or Intrinsics.centred(float(max(image_size)), image_size).camera()
         return FitResult.failed("geometry", lens, FitStatus.TOO_FEW_DATA, str(error))
+    if views.rms_px > rules.no_corners_px:
+        # No error bars hold for what is no lens.
+        return FitResult.failed("geometry", lens, views.status, *views.notes)
     x, cov = with_angles(views.intrinsics.vector, views.poses, views.cov, range(len(views.poses)), Rotation.identity())
     return _result(views, x, cov, np.zeros(3), prior)
 
@@ -146,8 +152,14 @@ def projection_sigma_px(
 
     Returns:
         one sigma in px along x and along y, per pixel; errors as for ``FitResult.sigma_of``.
+
+    Raises:
+        FitError: when the fitted distortion folds before a pixel, so that no direction appears there.
     """
     directions, places = jax.jit(panel_directions)(result.term, pixels), jax.jit(project_directions)
+    lost = ~(np.abs(np.asarray(places(result.term, directions)) - pixels).max(axis=1) < _ROUNDING_PX)
+    if lost.any():
+        raise FitError(folded(np.asarray(pixels)[lost]))
     return result.sigma_of(lambda term: np.asarray(places(term, directions)))
 
 

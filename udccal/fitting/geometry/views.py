@@ -38,6 +38,11 @@ from udccal.fitting.geometry.data import Gathered, best_poses
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 
+# From the centres of the outermost pixels to the furthest place at which a detector finds a corner.
+_BESIDE_PX = 1.0
+# Corners beyond that, and the part of all, which may be outliers.
+_FEW_BESIDE, _PART_BESIDE = 3, 0.01
+
 
 @in_float64
 def calibrate_views(
@@ -59,6 +64,7 @@ def calibrate_views(
     Raises:
         FitError: with fewer than 3 usable views (1 with a prior).
     """
+    check_picture(image_size, gathered.points)
     least, known = (rules.least_views, NOTHING_KNOWN) if prior is None else (1, prior)
     given, left_out = gathered.points, gathered.outliers
     if len(given.names) < least:
@@ -208,6 +214,26 @@ class _Search:
         return scales, ~off | (np.bincount(view[~off], minlength=views) < self.rules.least_corners)[view]
 
 
+def check_picture(image_size: object, points: Points) -> None:
+    """Refuse a size that no picture has, and corners that lie outside it.
+
+    Raises:
+        FitError: with what was found.
+    """
+    whole = np.asarray(image_size)
+    if whole.shape != (2,) or whole.dtype.kind not in "iu" or (whole < 1).any():
+        raise FitError(
+            f"Expected the picture's (columns, rows), two whole numbers, found {image_size!r:.80}. Give them."
+        )
+    beyond = ((points.image < -_BESIDE_PX) | (points.image > whole - 1 + _BESIDE_PX)).any(axis=1)
+    if beyond.sum() > max(_FEW_BESIDE, _PART_BESIDE * len(beyond)):
+        x, y = points.image[beyond][0]
+        raise FitError(
+            f"Expected corners within the picture of {whole[0]} x {whole[1]} px, found {int(beyond.sum())} outside, such "
+            f"as ({x:.1f}, {y:.1f}). Give points as (x, y), and the size as (columns, rows)."
+        )
+
+
 def _strange(robust: _Fitted, rules: GeometryRules, least: int) -> Bool[np.ndarray, " views"]:
     """Views that scatter far more than the others, unless too few would be left."""
     strange = robust.scales > rules.strange_view * np.median(robust.scales)
@@ -223,7 +249,7 @@ def _copies(robust: _Fitted, rules: GeometryRules, _: int) -> Bool[np.ndarray, "
     for later in range(views):
         for first in np.flatnonzero(~copies[:later]):
             common = corners[later].keys() & corners[first].keys()
-            pairs = np.array([(corners[later][at], corners[first][at]) for at in common]).reshape(-1, 2).T
+            pairs = np.array([(corners[later][at], corners[first][at]) for at in common], dtype=int).reshape(-1, 2).T
             apart2 = ((points.image[pairs[0]] - points.image[pairs[1]]) ** 2).mean(axis=1)
             alike = apart2.sum() < rules.copy * np.sum(points.sigma[pairs] ** 2)
             copies[later] |= len(common) >= rules.least_corners and bool(alike)
