@@ -225,12 +225,12 @@ def check_picture(image_size: object, points: Points) -> None:
         raise FitError(
             f"Expected the picture's (columns, rows), two whole numbers, found {image_size!r:.80}. Give them."
         )
-    beyond = ((points.image < -_BESIDE_PX) | (points.image > whole - 1 + _BESIDE_PX)).any(axis=1)
-    if beyond.sum() > max(_FEW_BESIDE, _PART_BESIDE * len(beyond)):
+    beyond = np.any((points.image < -_BESIDE_PX) | (points.image > whole - 1 + _BESIDE_PX), axis=1)
+    if beyond.sum() > max(_FEW_BESIDE, _PART_BESIDE * beyond.size):
         x, y = points.image[beyond][0]
         raise FitError(
-            f"Expected corners within the picture of {whole[0]} x {whole[1]} px, found {int(beyond.sum())} outside, such "
-            f"as ({x:.1f}, {y:.1f}). Give points as (x, y), and the size as (columns, rows)."
+            f"Expected corners within the picture of {whole[0]} x {whole[1]} px, found {int(beyond.sum())} outside, "
+            f"such as ({x:.1f}, {y:.1f}). Give points as (x, y), and the size as (columns, rows)."
         )
 
 
