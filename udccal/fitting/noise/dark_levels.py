@@ -64,21 +64,30 @@ class Means:
 def dark_means(data: NoiseMoments, fit: DarkFit, row_DN2: float | None) -> Means:
     """By the fit's distribution, unless mean codes are far off: read noise and dark current may have one tail.
 
-    Without ``row_DN2``, mean codes do not tell: rounding bends them.
+    Without ``row_DN2``, rounding hides the noise from frame to frame. Mean codes then tell no tail; where offsets
+    smear the rounding, they tell how far off the fit's mean is.
     """
     times = np.array([pair.exposure_s for pair in data.darks])
     fitted, nothing = (times, fit.means_DN, fit.variances_DN2), np.zeros(len(times))
-    if row_DN2 is None:
+    if row_DN2 is None and not fit.follows:
         return Means(*fitted, nothing, np.zeros(2))
     codes, dark = np.array([pair.mean_DN for pair in data.darks]), data.dark_moments
     everywhere = np.array([np.average(of.mean_DN, weights=of.samples) for of in dark])
+    by_fit = _Line.through(fit.means_DN, fit.variances_DN2, times)
+    if row_DN2 is None:
+        return Means(*fitted, nothing, _Line.through(codes, fit.variances_DN2, times).values - by_fit.values)
     own = np.array([of.temporal_DN2 / (2 * of.pixels) + row_DN2 / (2 * of.height) for of in dark])
     by_codes = _Line.through(codes, own, times)
-    doubt = by_codes.values - _Line.through(fit.means_DN, fit.variances_DN2, times).values
+    doubt = by_codes.values - by_fit.values
     if np.all(np.abs(doubt) <= data.rules.foreign_sigma * np.sqrt(np.diag(by_codes.cov))):
         return Means(*fitted, everywhere - codes, doubt)
     own += [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
     return Means(times, everywhere, own, nothing, np.zeros(2), True)
+
+
+def _frozen(temporal_DN2: float, q_DN: float) -> float:
+    """The part of the rounding's variance that a pixel with noise of this variance keeps from frame to frame."""
+    return float(np.exp(-4 * np.pi**2 * temporal_DN2 / q_DN**2))
 
 
 @final
@@ -109,8 +118,7 @@ def dark_levels(
         stack = data.dark_stack
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)
-        # Rounding of a pixel with little noise is nearly the same in every frame.
-        own = single_DN2 / stack.frames + data.rounding_DN2 * float(np.exp(-4 * np.pi**2 * single_DN2 / data.q_DN**2))
+        own = single_DN2 / stack.frames + data.rounding_DN2 * _frozen(single_DN2, data.q_DN)
         variances = np.append(variances, own / stack.mean_DN.size + rows / stack.frames)
     means = means + curvature * np.maximum(means - float(fit.values[0]), 0.0) ** 2
     line, apart, unsteady = _Line.through(means, variances, times), bool(np.ptp(times) > 0), 0.0
@@ -121,6 +129,8 @@ def dark_levels(
         unsteady *= (dof / max(dof - 2, 1)) ** 0.5
         line = _Line.through(means, variances + unsteady**2, times)
     cov = line.cov + np.outer(pairs.doubt, pairs.doubt)
+    # Rounding of pixels without noise is the same in every frame.
+    cov[0, 0] += data.rounding_DN2 * _frozen(float(fit.values[2]), data.q_DN) / data.dark_stack.mean_DN.size
     # All of black may be dark current.
     cov[1, 1] = cov[1, 1] if apart else (line.values[0] / max(float(times[0]), 1e-6)) ** 2
     current = Quantity.asked("dark current", float(line.values[1]), float(cov[1, 1]), data.dark_samples)
