@@ -85,9 +85,9 @@ def dark_means(data: NoiseMoments, fit: DarkFit, row_DN2: float | None) -> Means
     return Means(times, everywhere, own, nothing, np.zeros(2), True)
 
 
-def _frozen(temporal_DN2: float, q_DN: float) -> float:
-    """The part of the rounding's variance that a pixel with noise of this variance keeps from frame to frame."""
-    return float(np.exp(-4 * np.pi**2 * temporal_DN2 / q_DN**2))
+def _frozen(temporal_codes2: float) -> float:
+    """The part of its rounding that a pixel keeps from frame to frame, with noise of this variance in codes squared."""
+    return float(np.exp(-4 * np.pi**2 * temporal_codes2))
 
 
 @final
@@ -118,7 +118,7 @@ def dark_levels(
         stack = data.dark_stack
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)
-        own = single_DN2 / stack.frames + data.rounding_DN2 * _frozen(single_DN2, data.q_DN)
+        own = single_DN2 / stack.frames + data.rounding_DN2 * _frozen(single_DN2 / data.q_DN**2)
         variances = np.append(variances, own / stack.mean_DN.size + rows / stack.frames)
     means = means + curvature * np.maximum(means - float(fit.values[0]), 0.0) ** 2
     line, apart, unsteady = _Line.through(means, variances, times), bool(np.ptp(times) > 0), 0.0
@@ -130,7 +130,7 @@ def dark_levels(
         line = _Line.through(means, variances + unsteady**2, times)
     cov = line.cov + np.outer(pairs.doubt, pairs.doubt)
     # Rounding of pixels without noise is the same in every frame.
-    cov[0, 0] += data.rounding_DN2 * _frozen(float(fit.values[2]), data.q_DN) / data.dark_stack.mean_DN.size
+    cov[0, 0] += data.rounding_DN2 * _frozen(float(fit.values[2]) / data.q_DN**2) / data.dark_stack.mean_DN.size
     # All of black may be dark current.
     cov[1, 1] = cov[1, 1] if apart else (line.values[0] / max(float(times[0]), 1e-6)) ** 2
     current = Quantity.asked("dark current", float(line.values[1]), float(cov[1, 1]), data.dark_samples)
