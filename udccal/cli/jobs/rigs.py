@@ -15,7 +15,6 @@ from udccal.cli.output import Output
 from udccal.errors import RigError
 from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import storing_in
-from udccal.io.reading import reading
 from udccal.reports.tables import Table
 from udccal.rig import RIG_NAME, RigDescription, load_rig
 from udccal.rig_folders import RIG_FILE, find_rig, rig_folders, rig_names, shipped_rig_folder, user_rig_folder
@@ -169,9 +168,7 @@ def _write_new(folder: Path, text: str) -> None:
 
 def _known(folder: Path, own: bool) -> KnownRig:
     try:
-        # One that cannot be read is a row as well: the others are still listed.
-        with reading(folder / RIG_FILE, RigError):
-            rig = load_rig(folder)
+        rig = load_rig(folder)
     except RigError as error:
         return KnownRig(folder.name, own, folder, "", "", str(error))
     return KnownRig(folder.name, own, folder, rig.camera.model, rig.panel.model, "")
