@@ -131,12 +131,13 @@ class NoiseData:
             raise FitError(f"Expected at most {_MOST_FRAMES} levels and frames of a stack. Average some first.")
         if stacks and min(map(len, stacks)) < 2:
             raise FitError("Expected at least two dark and two bright frames in the stack, found fewer. Leave it out.")
-        exposed: list[tuple[str, ExposureLevel | SpatialStack]]
+        exposed: list[tuple[str, ExposureLevel | SpatialStack | Averaged]]
         exposed = [(f"level {index}", level) for index, level in enumerate(self.levels)]
         if self.stack is not None:
             exposed.append(("the stack", self.stack))
+        exposed += [("an average of the stack", one) for one in of_stack if isinstance(one, Averaged)]
         for where, one in exposed:
-            photons = 0.0 if one.photons is None else one.photons
+            photons = 0.0 if isinstance(one, Averaged) or one.photons is None else one.photons
             for name, value in (("an exposure in seconds", one.exposure_s), ("a number of photons", photons)):
                 if not isinstance(value, int | float | np.integer | np.floating):
                     raise FitError(f"Expected {where} to have {name}, found {found_instead(value)}. Give one number.")
@@ -160,6 +161,23 @@ def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
     if shape is not None and array.shape != shape:
         raise FitError(f"Expected frames of {shape} samples, found {array.shape}. Sort the frames by sensor.")
     return array if array.dtype == np.uint16 else array.astype(np.uint16)
+
+
+def checked_average(average: Averaged, shape: tuple[int, ...]) -> Averaged:
+    """The average; a FitError where it is not the mean of a number of frames of ``shape``."""
+    mean, frames = average.mean_DN, average.frames
+    if not isinstance(mean, np.ndarray) or mean.dtype.kind != "f" or mean.shape != shape:
+        found = f"float array of {shape} samples, as the frames of the pairs, found {found_instead(mean)}"
+        raise FitError(f"Expected an average of the stack as {found}. Give the mean as it is, without rounding.")
+    if not np.isfinite(mean).all():
+        bad = int(mean.size - np.isfinite(mean).sum())
+        raise FitError(
+            f"Expected codes in an average of the stack, found {bad} samples that are no number. Leave it out."
+        )
+    if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or frames < 1:
+        found = str(frames) if isinstance(frames, int | float | np.number) else found_instead(frames)
+        raise FitError(f"Expected an average of 1 or more frames in the stack, found {found}. Give their number.")
+    return average
 
 
 def read_noise(session: Session) -> NoiseData:

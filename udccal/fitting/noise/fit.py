@@ -18,6 +18,7 @@ from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_
 from udccal.fitting.noise.moments import NoiseMoments, bins, reduced, stacked
 from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import Pattern, prnu, rough_median
+from udccal.fitting.noise.stacks import contradiction
 from udccal.models.noise import Noise, linear_signal
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus
@@ -68,6 +69,8 @@ def fit_moments(data: NoiseMoments, nominal: Noise) -> FitResult[Noise]:
     """Fit the noise term to frames that are reduced; ``nominal`` is returned as the term where no fit is possible."""
     if refused := _too_little(data):
         return FitResult.failed("noise", nominal, *refused)
+    if wrong := contradiction(data):
+        return FitResult.failed("noise", nominal, FitStatus.POOR_FIT, wrong)
     start = start_values(data.darks)
     dark = fit_dark_terms(data, rough_gain(data, float(start[0]), float(start[2])), start)
     curve = fit_curve(data, dark)

@@ -14,8 +14,8 @@ from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.noise.codes import excess_kurtosis, smeared, standard_cdf
 from udccal.fitting.noise.dark import DarkTerms
-from udccal.fitting.noise.moments import NoiseMoments, stacked
-from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
+from udccal.fitting.noise.moments import Moments, NoiseMoments, stacked
+from udccal.fitting.noise.transfer import DarkVariance, Five, Grid, Levels, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]
 # Part of full samples with the last code above which that part, and not the mean, gives the level.
@@ -142,6 +142,17 @@ def piled_up(data: NoiseMoments, dark: DarkTerms) -> tuple[float, float] | None:
     return level, float(np.hypot(spread / np.sqrt(count), floor / count * half * q))
 
 
+def steadied(flats: tuple[Moments, ...], variance_DN2: Grid, above_DN: Grid) -> Grid:
+    """The variances of flats without what light that differs between the frames adds to them.
+
+    Such frames differ, in addition to noise, by the bin's pattern (shading, PRNU) times that.
+    """
+    shift2 = np.stack([np.var(flat.shift_DN, axis=0, ddof=1) for flat in flats])
+    pattern2 = np.maximum(stacked(flats, "spread_DN") ** 2 - variance_DN2, 0.0)
+    pattern2 /= np.where(above_DN > 0, above_DN, np.inf) ** 2
+    return np.maximum(variance_DN2 - shift2 * pattern2, 0.0)
+
+
 def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: float) -> Levels:
     """The flats as the transfer fit takes them, with the bins that lie safely inside the sensor's range."""
     flats = data.flats if data.flat_seen is None else (*data.flats, data.flat_seen)
@@ -150,10 +161,7 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
         # What was taken for hits were tails of the noise.
         variance = variance + np.array([[of.outlier_variance_DN2] for of in flats])
     above, K, q = mean - dark.black_DN, dark.K_DN_per_e, data.q_DN
-    # Frames of different brightness differ, in addition to noise, by the bin's pattern (shading, PRNU) times that.
-    shift2 = np.stack([np.var(flat.shift_DN, axis=0, ddof=1) for flat in flats])
-    pattern2 = np.maximum(spread**2 - variance, 0.0) / np.where(above > 0, above, np.inf) ** 2
-    variance = np.maximum(variance - shift2 * pattern2, 0.0)
+    variance = steadied(flats, variance, above)
     # Bins keep 5 sigma of their noise and 2.5 of their shading away from the range's ends.
     temporal, uneven = 5.0 * np.sqrt(variance), 2.5 * np.sqrt(np.maximum(spread**2 - variance, 0.0))
     usable = (above > 0) & (above <= up_to_DN) & (mean + temporal + uneven < ceiling_DN) & (mean > temporal)

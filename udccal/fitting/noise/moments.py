@@ -7,9 +7,9 @@ first frame are summed, and the squares of these, so that float32 loses no digit
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import cv2
@@ -18,7 +18,17 @@ from jaxtyping import Float, Float32, Int
 
 from udccal.errors import FitError
 from udccal.fitting.noise.codes import DarkPair, dark_pair
-from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack, loaded
+from udccal.fitting.noise.data import (
+    Averaged,
+    Codes,
+    ExposureLevel,
+    Frame,
+    NoiseData,
+    NoiseRules,
+    SpatialStack,
+    checked_average,
+    loaded,
+)
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
 
@@ -51,7 +61,7 @@ class Moments:
     of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
     is the fraction of the samples with the largest code, and ``codes`` the histogram of the first frame. ``outliers``
     were hits, and left out; ``outlier_powers`` are the sums of the second and fourth powers of their differences from
-    the first frame.
+    the first frame. ``repeated``: some frames are copies of others.
     """
 
     exposure_s: float
@@ -70,6 +80,7 @@ class Moments:
     codes: Int[np.ndarray, " codes"]
     outliers: int
     outlier_powers: tuple[float, float]
+    repeated: bool = False
 
     @property
     def frames(self) -> int:
@@ -167,6 +178,13 @@ def reduce_frames(
     )
 
 
+def fingerprint(frame: Codes) -> int | None:
+    """A number that tells noisy frames apart; None where most pixels have one code, so that frames may well agree."""
+    sample = frame[:: max(len(frame) // 64, 1)]
+    low, high = np.percentile(sample, [16.0, 84.0])
+    return hash(sample.tobytes()) if high > low else None
+
+
 def converter_step(frame: Codes) -> int:
     """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
     codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
@@ -244,8 +262,16 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     metered = all(level.photons is not None for level in brights) and (stack is None or stack.photons is not None)
 
     def moments(frames: Sequence[Frame], exposure_s: float, photons: float | None = None) -> tuple[Averaged, Moments]:
-        checked = (loaded(frame, sample.shape) for frame in frames)
-        return reduce_frames(checked, exposure_s, photons if metered else None, period, rules)
+        marks: list[int] = []
+
+        def checked() -> Iterator[Codes]:
+            for frame in frames:
+                yield (codes := loaded(frame, sample.shape))
+                if mark := fingerprint(codes):
+                    marks.append(mark)
+
+        mean, found = reduce_frames(checked(), exposure_s, photons if metered else None, period, rules)
+        return mean, replace(found, repeated=len(set(marks)) < len(marks))
 
     def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
         first, second = (loaded(frame, sample.shape) for frame in level.dark)
@@ -253,7 +279,9 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level.exposure_s)[1]
 
     def average(frames: Sequence[Frame] | Averaged, stack: SpatialStack) -> tuple[Averaged, Moments | None]:
-        return (frames, None) if isinstance(frames, Averaged) else moments(frames, stack.exposure_s, stack.photons)
+        if isinstance(frames, Averaged):
+            return checked_average(frames, sample.shape), None
+        return moments(frames, stack.exposure_s, stack.photons)
 
     with ThreadPoolExecutor(2) as pool:
         # The stacks are the longest tasks: they go first.
