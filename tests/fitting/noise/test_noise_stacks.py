@@ -117,3 +117,13 @@ def test_an_average_of_no_frames_is_refused(change: dict[str, Any], words: str) 
 def test_an_average_says_what_its_frames_say() -> None:
     result = fit_noise(with_stack(lambda dark, bright: (averaged(dark), averaged(bright))))
     assert np.abs(errors_in_sigma(result, SENSOR)).max() < 4.5
+
+
+@pytest.mark.parametrize("bad", [slice(None), slice(2, 3)])
+def test_dark_pairs_of_one_frame_are_a_poor_fit(bad: slice) -> None:
+    """They show no read noise: sigma_d was 0.08 electrons instead of 4."""
+    levels = [of for of in sound().levels if of.dark]
+    levels[bad] = [replace(of, dark=(of.dark[0], np.array(of.dark[0]))) for of in levels[bad]]
+    result = fit_noise(replace(sound(), levels=[*levels, *(of for of in sound().levels if of.bright)]))
+    assert result.status is FitStatus.POOR_FIT
+    assert "copies of one frame at" in result.notes[0]

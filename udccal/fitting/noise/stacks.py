@@ -21,11 +21,14 @@ def contradiction(data: NoiseMoments) -> str | None:
 
 
 def _copies(data: NoiseMoments) -> Iterator[str]:
-    """Noise never repeats: copies show none, and count as new measurements."""
-    for name, seen in (("dark", data.dark_seen), ("flat", data.flat_seen)):
+    """Noise never repeats: copies show none, and count as new measurements. Flats tell it by their variance."""
+    for name, seen in (("dark stack", data.dark_seen), ("flat stack", data.flat_seen)):
         if seen is not None and seen.repeated:
-            expected = f"Expected noise between the {seen.frames} frames of the {name} stack, found copies of one frame"
+            expected = f"Expected noise between the {seen.frames} frames of the {name}, found copies of one frame"
             yield f"{expected}. Give each frame once."
+    if twice := [of.exposure_s for of in data.dark_moments if of.repeated]:
+        found = f"copies of one frame at {len(twice)} exposures (the first of {twice[0]:.4g} s)"
+        yield f"Expected noise between the two frames of dark pairs, found {found}. Give two frames that were taken."
 
 
 def _dark_stack(data: NoiseMoments) -> Iterator[str]:
