@@ -250,6 +250,51 @@ def test_an_exposure_that_is_a_frame_is_refused() -> None:
         fit_noise(NoiseData([level]))
 
 
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"levels": None}, "sequence of exposure levels, found NoneType"),
+        ({"levels": (level for level in [])}, "sequence of exposure levels, found generator"),
+        ({"levels": ExposureLevel(0.1)}, "sequence of exposure levels, found ExposureLevel"),
+        ({"levels": [FRAME]}, "every level as an ExposureLevel, found uint16"),
+        ({"top_code": "4095"}, "top_code as a whole number of 1 to 65535, found '4095'"),
+        ({"top_code": float("nan")}, "found nan"),
+        ({"top_code": 1e9}, "found 1000000000.0"),
+        ({"top_code": True}, "found True"),
+        ({"top_code": 70_000}, "found 70000"),
+    ],
+)
+def test_data_of_another_kind_are_refused(changed: dict[str, Any], sentence: str) -> None:
+    data = NoiseData([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))])
+    for name, value in changed.items():
+        object.__setattr__(data, name, value)
+    with pytest.raises(FitError, match=sentence):
+        fit_noise(data)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("exposure_s", True, "level 0 to have an exposure in seconds, found bool"),
+        ("photons", True, "level 0 to have a number of photons, found bool"),
+        ("dark", None, "dark frames of level 0 as a sequence, found NoneType"),
+        ("bright", (frame for frame in [FRAME]), "bright frames of level 0 as a sequence, found generator"),
+    ],
+)
+def test_a_level_of_another_kind_is_refused(name: str, value: Any, sentence: str) -> None:
+    level = ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))
+    object.__setattr__(level, name, value)
+    with pytest.raises(FitError, match=sentence):
+        fit_noise(NoiseData([level]))
+
+
+def test_pairs_may_be_arrays() -> None:
+    levels, stack = capture(PLAIN, 3)
+    stacked = [replace(of, dark=np.stack(list(of.dark)), bright=np.stack(list(of.bright))) for of in levels]
+    alike = [fit_noise(NoiseData(these, stack, top_code=4095)) for these in (levels, stacked)]
+    assert [one.value for one in alike[0].estimates] == [one.value for one in alike[1].estimates]
+
+
 def test_nothing_at_all_is_too_few() -> None:
     assert fit_noise(NoiseData([])).status is FitStatus.TOO_FEW_DATA
 

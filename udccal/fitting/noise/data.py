@@ -21,6 +21,7 @@ Codes = UInt16[np.ndarray, "rows columns"]
 Frame = UInt16[np.ndarray, "_rows _columns"] | UInt8[np.ndarray, "_rows _columns"] | Callable[[], np.ndarray]
 
 _LEAST_SIDE, _MOST_SIDE, _MOST_FRAMES = 16, 65536, 4096
+_LARGEST_CODE = 65535
 
 
 @final
@@ -83,13 +84,13 @@ class ExposureLevel:
 
     Attributes:
         exposure_s: exposure time.
-        dark, bright: pairs of frames without light and under even light; empty where not taken.
+        dark, bright: pairs of frames without light and under even light, or arrays of them; empty where not taken.
         photons: mean number per pixel, where known; exposure times take its place where a level has none.
     """
 
     exposure_s: float
-    dark: tuple[Frame, ...] = ()
-    bright: tuple[Frame, ...] = ()
+    dark: Sequence[Frame] | np.ndarray = ()
+    bright: Sequence[Frame] | np.ndarray = ()
     photons: float | None = None
 
 
@@ -99,8 +100,8 @@ class SpatialStack:
     """Many dark and many bright frames, or their averages, for the fixed pattern (EMVA 1288, clause 8)."""
 
     exposure_s: float
-    dark: Sequence[Frame] | Averaged
-    bright: Sequence[Frame] | Averaged
+    dark: Sequence[Frame] | np.ndarray | Averaged
+    bright: Sequence[Frame] | np.ndarray | Averaged
     photons: float | None = None
 
 
@@ -122,31 +123,52 @@ class NoiseData:
     top_code: int | None = None
 
     def check(self) -> None:
-        """Check numbers of frames, exposures and photons; a FitError names the level or stack that is not possible."""
-        of_stack = () if self.stack is None else (self.stack.dark, self.stack.bright)
-        if wrong := [type(one).__name__ for one in of_stack if not isinstance(one, Sequence | np.ndarray | Averaged)]:
-            raise FitError(f"Expected the stack's frames as a sequence or an average, found {wrong[0]}. Leave it out.")
-        stacks = [one for one in of_stack if not isinstance(one, Averaged)]
-        if max([len(self.levels), *map(len, stacks)]) > _MOST_FRAMES:
+        """Check kinds, numbers of frames, exposures and photons; a FitError names the level or stack that is wrong."""
+        self._check_kinds()
+        stack = () if self.stack is None else (self.stack.dark, self.stack.bright)
+        frames = [one for one in stack if not isinstance(one, Averaged)]
+        if max([len(self.levels), *map(len, frames)]) > _MOST_FRAMES:
             raise FitError(f"Expected at most {_MOST_FRAMES} levels and frames of a stack. Average some first.")
-        if stacks and min(map(len, stacks)) < 2:
+        if frames and min(map(len, frames)) < 2:
             raise FitError("Expected at least two dark and two bright frames in the stack, found fewer. Leave it out.")
         exposed: list[tuple[str, ExposureLevel | SpatialStack | Averaged]]
         exposed = [(f"level {index}", level) for index, level in enumerate(self.levels)]
         if self.stack is not None:
             exposed.append(("the stack", self.stack))
-        exposed += [("an average of the stack", one) for one in of_stack if isinstance(one, Averaged)]
+        exposed += [("an average of the stack", one) for one in stack if isinstance(one, Averaged)]
         for where, one in exposed:
             photons = 0.0 if isinstance(one, Averaged) or one.photons is None else one.photons
             for name, value in (("an exposure in seconds", one.exposure_s), ("a number of photons", photons)):
-                if not isinstance(value, int | float | np.integer | np.floating):
+                if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
                     raise FitError(f"Expected {where} to have {name}, found {found_instead(value)}. Give one number.")
                 if not (np.isfinite(value) and value >= 0):
                     raise FitError(f"Expected {where} to have {name}, found {value}. Give a number of 0 or more.")
         for index, level in enumerate(self.levels):
-            for name, frames in (("dark", level.dark), ("bright", level.bright)):
-                if len(frames) not in (0, 2):
-                    raise FitError(f"Expected two {name} frames in level {index} or none, found {len(frames)}.")
+            for name, pair in (("dark", level.dark), ("bright", level.bright)):
+                if len(pair) not in (0, 2):
+                    raise FitError(f"Expected two {name} frames in level {index} or none, found {len(pair)}.")
+
+    def _check_kinds(self) -> None:
+        """A FitError where levels, frames or the top code are of another kind."""
+        if not isinstance(self.levels, Sequence | np.ndarray):
+            raise FitError(f"Expected a sequence of exposure levels, found {found_instead(self.levels)}. Give a list.")
+        if wrong := [found_instead(one) for one in self.levels if not isinstance(one, ExposureLevel)]:
+            raise FitError(
+                f"Expected every level as an ExposureLevel, found {wrong[0]}. Give exposure and frames in one."
+            )
+        for index, level in enumerate(self.levels):
+            for name, pair in (("dark", level.dark), ("bright", level.bright)):
+                if not isinstance(pair, Sequence | np.ndarray):
+                    found = f"found {found_instead(pair)}. Leave them out where none were taken"
+                    raise FitError(f"Expected the {name} frames of level {index} as a sequence, {found}.")
+        stack = () if self.stack is None else (self.stack.dark, self.stack.bright)
+        if wrong := [type(one).__name__ for one in stack if not isinstance(one, Sequence | np.ndarray | Averaged)]:
+            raise FitError(f"Expected the stack's frames as a sequence or an average, found {wrong[0]}. Leave it out.")
+        top = self.top_code
+        whole = isinstance(top, int | np.integer) and not isinstance(top, bool)
+        if top is not None and not (whole and 1 <= top <= _LARGEST_CODE):
+            found = f"{top!r}. Leave it out where it is not known"
+            raise FitError(f"Expected top_code as a whole number of 1 to {_LARGEST_CODE}, found {found}.")
 
 
 def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from udccal.errors import FitError
+from udccal.errors import FitError, found_instead
 from udccal.fitting.noise.codes import DarkPair, dark_pair
 from udccal.fitting.noise.data import (
     Averaged,
@@ -252,8 +252,10 @@ class NoiseMoments:
 
 def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     """All frames as moments and histograms for the fit; None without a dark and a bright pair."""
+    if not isinstance(data, NoiseData):
+        raise FitError(f"Expected frames as NoiseData, found {found_instead(data)}. Give it levels of exposure.")
     data.check()
-    darks, brights = [one for one in data.levels if one.dark], [one for one in data.levels if one.bright]
+    darks, brights = ([of for of in data.levels if len(getattr(of, name))] for name in ("dark", "bright"))
     if not darks or not brights:
         return None
     stack, period = data.stack, 2 if data.bayer else 1
@@ -261,7 +263,7 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     q_DN = converter_step(sample)
     metered = all(level.photons is not None for level in brights) and (stack is None or stack.photons is not None)
 
-    def moments(frames: Sequence[Frame], exposure_s: float, photons: float | None = None) -> tuple[Averaged, Moments]:
+    def moments(frames: Iterable[Frame], exposure_s: float, photons: float | None = None) -> tuple[Averaged, Moments]:
         marks: list[int] = []
 
         def checked() -> Iterator[Codes]:
@@ -278,7 +280,7 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         _check_darker(first, level.exposure_s, flats)
         return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level.exposure_s)[1]
 
-    def average(frames: Sequence[Frame] | Averaged, stack: SpatialStack) -> tuple[Averaged, Moments | None]:
+    def average(frames: Iterable[Frame] | Averaged, stack: SpatialStack) -> tuple[Averaged, Moments | None]:
         if isinstance(frames, Averaged):
             return checked_average(frames, sample.shape), None
         return moments(frames, stack.exposure_s, stack.photons)
