@@ -230,7 +230,7 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     rng = np.random.default_rng(2)
     dark = 64 + 0.3 * rng.standard_normal((100, 100))
     dark[3, 4] = dark[50, 60] = 90.0
-    assert dsnu(dark, Quantity(0.09, 0.0), 0.0, RULES.defect_sigma).places == ((3, 4), (50, 60))
+    assert dsnu(dark, Quantity(0.09, 0.0), 0.0, RULES.defect_sigma, 1).places == ((3, 4), (50, 60))
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
     assert converter_step(frame) == 1
     assert converter_step(frame * np.uint16(16)) == 16

@@ -161,7 +161,7 @@ def _offsets(data: NoiseMoments, codes: _Codes, single: Quantity) -> Pattern:
     """DSNU of the stack's average, or of the histograms where rounding biases the average."""
     stack = data.dark_stack
     temporal = Quantity(single.value / stack.frames, single.variance / stack.frames**2)
-    offsets = dsnu(stack.mean_DN, temporal, codes.row_DN**2 / stack.frames, data.rules.defect_sigma)
+    offsets = dsnu(stack.mean_DN, temporal, codes.row_DN**2 / stack.frames, data.rules.defect_sigma, data.q_DN)
     if codes.white:
         return offsets
     sigma = float(np.hypot(codes.fit.cov[3, 3] ** 0.5, codes.unresolved_DN2))

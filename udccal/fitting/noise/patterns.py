@@ -78,16 +78,19 @@ class Pattern:
     structure2: float = 0.0
 
 
-def dsnu(dark_DN: Picture, temporal: Quantity, row_DN2: float, defect_sigma: float) -> Pattern:
+def dsnu(dark_DN: Picture, temporal: Quantity, row_DN2: float, defect_sigma: float, q_DN: int) -> Pattern:
     """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), with row and column patterns.
 
-    The average has the variance ``temporal`` [DN^2] without row noise, which adds ``row_DN2``.
+    The average has the variance ``temporal`` [DN^2] without row noise, which adds ``row_DN2``; ``q_DN`` is the
+    converter's step.
     """
     about = dark_DN.astype(np.float64)
     sample = about[:: max(1, len(about) // 256)]
     middle = float(np.median(sample))
-    # Averages of few frames are coarse: a spread below their step does not measure the usual scatter.
-    reach = defect_sigma * MAD_TO_SIGMA * float(np.median(np.abs(sample - middle)))
+    # Averages of few frames are coarse: a spread below their step does not measure the usual scatter. Where half of the
+    # pixels have one code in every frame, those that have the next one in some are no defects.
+    usual = float(np.median(np.abs(sample - middle)))
+    reach = defect_sigma * MAD_TO_SIGMA * usual if usual > 1e-3 * q_DN else q_DN
     bad = np.abs(about - middle) > max(reach, float(sample.std()), 1e-12)
     mean = float(about[~bad].mean()) if not bad.all() else 0.0
     about -= mean

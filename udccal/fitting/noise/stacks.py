@@ -43,10 +43,9 @@ def _dark_stack(data: NoiseMoments) -> Iterator[str]:
     if beyond > 0:
         more = 1.5 * beyond * float(np.ptp(means)) / apart if apart > 0 else np.inf
     if not usual - drift <= mean <= usual + drift + more:
-        yield (
-            f"Expected a dark stack of about {usual:.4g} DN, as the dark pairs, found {mean:.4g} DN: some of its "
-            f"frames may be lit. {_SORT}"
-        )
+        why = "some of its frames may be lit" if mean > usual else "black may be subtracted from it"
+        found = f"found {mean:.4g} DN: {why}"
+        yield f"Expected a dark stack of about {usual:.4g} DN, as the dark pairs, {found}. {_SORT}"
     flat = float(data.flat_stack.mean_DN.mean())
     if mean > flat + drift and stack.exposure_s <= data.flat_stack.exposure_s:
         found = f"{mean:.4g} DN and a flat stack of {flat:.4g} DN: they may be exchanged"
