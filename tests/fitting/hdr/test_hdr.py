@@ -74,6 +74,19 @@ def test_light_within_two_codes_of_black_is_told_where_the_noise_smears_no_code(
     assert merge_bracket(frames, times, NOISE).rounded_below == 0.0
 
 
+@pytest.mark.parametrize("times", [np.array([0.05]), 1e-3 * 3.0 ** np.arange(5)], ids=["one exposure", "five"])
+def test_dark_pixels_of_a_quiet_sensor_lie_within_their_sigma(times: np.ndarray) -> None:
+    # One electron per exposure: half of the pixels come out below zero, where the weights know too much.
+    rng, rate = np.random.default_rng(3), 20.0
+    electrons = [rng.poisson(rate * t, (200, 200)) + 1.5 * rng.standard_normal((200, 200)) for t in times]
+    codes = np.clip(np.rint(64.0 + np.array(electrons)), 0, 4095).astype(np.uint16)
+    quiet = Noise(1.0, 64.0, 4095.0, 1.5, 0.1, 0.0, 1.0, 0.0, 0.0, 0.0)
+    merge = merge_bracket(codes, times, quiet)
+    z = (merge.rate_e_per_s - rate) / merge.sigma_e_per_s
+    assert np.mean(np.abs(z) > 4.5) < 1e-3
+    assert z.std() == pytest.approx(1.0, abs=0.1)
+
+
 @pytest.mark.medium
 def test_repeats_lower_sigma_as_they_should() -> None:
     one = merge_bracket(bracket(1e3, EXPOSURES[-1:], 2), EXPOSURES[-1:], NOISE)

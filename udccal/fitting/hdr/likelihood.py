@@ -149,6 +149,18 @@ def _bias_by_information(
     return 0.5 * (scale**3 * density * (1 + z * (z - ratio))).sum(axis=0) / xp.maximum(information, _TINY)
 
 
+def _upward_deviance(
+    beyond: Float[Arrayish, "n pixels"],
+    mean: Float[Arrayish, "n pixels"],
+    variance: Float[Arrayish, "n pixels"],
+    xp: ModuleType,
+) -> Float[Arrayish, "n pixels"]:
+    """Deviance of scaled counts of this variance and skewness: few electrons scatter more upwards than downwards."""
+    scale = xp.maximum(mean / variance, 0.03)
+    relative = xp.maximum(beyond * scale / variance, 0)
+    return 2 * variance / scale**2 * ((1 + relative) * xp.log1p(relative) - relative)
+
+
 def merge_block(
     frames: UInt16[Arrayish, "n pixels"],
     times: Float[Arrayish, " n"],
@@ -186,6 +198,8 @@ def merge_block(
     scale = xp.where(is_open | believed, time / xp.sqrt(variance), 0)
     # Where exposures lie so far apart that the first order is a sigma and more, it is no longer the bias.
     bias = xp.minimum(_bias_by_information(z, ratio, scale, xp) / total, 1 / xp.sqrt(total))
+    # Where noise makes the rate negative, samples scatter as without light, not as their weights say.
+    stated = xp.maximum((information * variance / xp.maximum(variance, expected(0 * rate)[1])).sum(axis=0), _TINY)
     mean, variance = expected(rate)
     # Below zero rate the rounds may not have settled: a sample's deviation is that from the rate of these weights.
     slope = xp.where(is_open, time / variance, 0)
@@ -200,13 +214,10 @@ def merge_block(
     variance = xp.maximum(variance, mean + sensor.floor_e2) + sensor.offset_e**2
     own = xp.where(left_out, 0, beyond**2 / variance)
     worst, used = own.argmax(axis=0), is_open.sum(axis=0, dtype=np.int32)
-    # Few electrons scatter more upwards than downwards: the deviance of scaled counts of this variance and skewness.
-    scale = xp.maximum(mean / variance, 0.03)
-    relative = xp.maximum(beyond * scale / variance, 0)
-    upwards = 2 * variance / scale**2 * ((1 + relative) * xp.log1p(relative) - relative)
-    deviation2 = xp.take_along_axis(xp.where(beyond > 0, xp.minimum(own, upwards), own), worst[None], axis=0)[0]
+    fewer = xp.where(beyond > 0, xp.minimum(own, _upward_deviance(beyond, mean, variance, xp)), own)
+    deviation2 = xp.take_along_axis(fewer, worst[None], axis=0)[0]
     offset = sensor.offset_e * slope.sum(axis=0) / now
-    return BlockMerge(rate - bias, xp.sqrt(1 / total + offset**2), used, worst, deviation2)
+    return BlockMerge(rate - bias, xp.sqrt(1 / stated + offset**2), used, worst, deviation2)
 
 
 compiled_merge_block = jax.jit(merge_block, static_argnames=("believed_sigma", "xp"))
