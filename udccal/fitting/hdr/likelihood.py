@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import ModuleType
-from typing import final
+from typing import Final, final
 
 import equinox as eqx
 import jax
@@ -34,6 +34,19 @@ _PEAK = 0.3989422804  # of the normal density
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
 _LEAST_VARIANCE = 0.25
 _TINY = 1e-30
+# Numbers that a sensor may have: single precision holds their squares.
+_POSSIBLE: Final = {
+    "K_DN_per_e": (1e-4, 1e5),
+    "black_DN": (-65536.0, 65536.0),
+    "saturation_DN": (1.0, 2.0**20),
+    "sigma_d_e": (0.0, 1e6),
+    "q_DN": (1e-3, 65536.0),
+    "dark_current_e_per_s": (-1e6, 1e8),
+    "DSNU1288_e": (0.0, 1e6),
+    "nonlinearity": (-0.25, 0.25),
+}
+# A dark signal below zero is a black level that moves with the exposure: by no more than this part of a full pixel.
+_LEAST_DARK: Final = -0.01
 
 
 @final
@@ -88,22 +101,18 @@ class SensorNumbers(eqx.Module):
     @classmethod
     def of(cls, noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
         """The numbers of a noise model, times in units of ``unit_s``."""
-        K, black, saturation, sigma_d, q, dark, offset = values = [
-            float(np.asarray(part))
-            for part in (noise.K_DN_per_e, noise.black_DN, noise.saturation_DN, noise.sigma_d_e, noise.q_DN,
-                         noise.dark_current_e_per_s, noise.DSNU1288_e)
-        ]  # fmt: skip
-        if not (np.isfinite(values).all() and K > 0 and sigma_d >= 0 and saturation > black):
-            found = f"K {K:g} DN/e, black {black:g} DN, saturation {saturation:g} DN, sigma_d {sigma_d:g} e"
-            raise FitError(
-                f"Expected a noise model with a gain above 0 and saturation above black, found {found}. Fit it."
-            )
+        K, black, saturation, sigma_d, q, dark, offset, bent = (_possible(noise, name) for name in _POSSIBLE)
+        if not saturation > black:
+            raise FitError(f"Expected saturation above black, found {saturation:g} and {black:g} DN. Fit the noise.")
+        if dark * unit_s < _LEAST_DARK * (saturation - black) / K:
+            found = f"found {dark:g} e/s, which is {dark * unit_s:.3g} e in the longest exposure"
+            raise FitError(f"Expected a dark current of about 0 or more, {found}. Fit the noise.")
         # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
         floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
         # The first harmonic of the codes' steps, as far as noise does not smear them.
         rounding = float(q / K / np.pi * np.exp(-2 * (np.pi * sigma_d * K / q) ** 2))
         below = rules.least_codes * q / K if rounding > rules.black_off * floor**0.5 else 0.0
-        bend = float(np.asarray(noise.bend_per_DN))
+        bend = bent / (saturation - black)
         level = linear_signal(saturation - black, bend) / K - rules.margin_sigma * floor**0.5
         return cls(black, 1 / K, dark * unit_s, floor, level, offset, rounding, below, bend)
 
@@ -111,6 +120,16 @@ class SensorNumbers(eqx.Module):
         """Light of samples in e-, dark current included; the response's bend is taken out."""
         signal: Float[Arrayish, "n pixels"] = linear_signal(codes - self.black_DN, self.bend_per_DN)
         return signal * self.e_per_DN
+
+
+def _possible(noise: Noise, name: str) -> float:
+    """A number of the noise model, which a sensor may have."""
+    value, (low, high) = getattr(noise, name, None), _POSSIBLE[name]
+    number = np.asarray(value)
+    if number.ndim or number.dtype.kind not in "fiu" or not low <= number <= high:
+        expected = f"Expected a noise model whose {name} is a number from {low:g} to {high:g}"
+        raise FitError(f"{expected}, found {value}. Fit the noise.")
+    return float(number)
 
 
 class BlockMerge(eqx.Module):

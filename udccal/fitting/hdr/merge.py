@@ -71,8 +71,8 @@ def merge_bracket(
         rate and sigma in e-/s of every pixel, and the outliers.
 
     Raises:
-        FitError: when frames are not codes, exposures are not positive or not as many as frames, or a number of the
-            noise is impossible.
+        FitError: when frames are not codes, exposures are impossible or not as many as frames, or a number of the noise
+            is impossible.
     """
     rules = rules or HdrRules()
     times = _checked(frames, exposures_s)
@@ -119,8 +119,9 @@ def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposur
         times = np.asarray(exposures_s, dtype=np.float64)
     except (TypeError, ValueError):
         times = np.zeros(0)
-    if times.shape != (len(frames),) or not len(times) or not np.all((times > 0) & np.isfinite(times)):
-        expected = f"Expected a positive exposure for each of the {len(frames)} frames of a bracket"
+    # Single precision holds the rates of these exposures.
+    if times.shape != (len(frames),) or not len(times) or not np.all((times >= 1e-9) & (times <= 1e6)):
+        expected = f"Expected a positive exposure (1e-9 to 1e6 s) for each of the {len(frames)} frames of a bracket"
         raise FitError(f"{expected}, found {np.atleast_1d(times)[:8].tolist()}. Give the exposures in seconds.")
     return times
 
