@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
 from udccal.bins import Bins
+from udccal.fitting.backscatter.checks import check_data, check_shapes
 from udccal.fitting.backscatter.model import Moves, PanelCrop, PerBin, PerShot, Pictures, Rays, Usable, corners_of
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.nominal import nominal_backscatter
@@ -39,6 +40,9 @@ class Binned:
         clipped: True for bins with a clipped sample.
         exposure_s: of each shot.
         scatter: variance between the frames of a shot over the noise model's; NaN where not known.
+
+    Raises:
+        FitError: when an array is not of its kind, or not of the shape of the rates.
     """
 
     rate: Float[np.ndarray, "shots 3 *grid"]
@@ -47,6 +51,9 @@ class Binned:
     clipped: Bool[np.ndarray, "shots 3 *grid"]
     exposure_s: Float[np.ndarray, " shots"]
     scatter: Float[np.ndarray, " shots"]
+
+    def __post_init__(self) -> None:
+        check_shapes(self)
 
     @classmethod
     def joined(cls, parts: Sequence[Binned]) -> Binned:
@@ -175,12 +182,18 @@ class BackscatterData:
         shown: the pictures, values 0 to 255, in the crop.
         crop: the part of the panel that the camera can see (``visible_crop``).
         names: names of the pictures.
+
+    Raises:
+        FitError: when there is not one picture and name for each shot, or a number cannot be.
     """
 
     shots: Binned
     shown: UInt8[np.ndarray, "pictures crop_rows crop_columns 3"]
     crop: PanelCrop
     names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_data(self)
 
     @functools.cached_property
     def pictures(self) -> Pictures:

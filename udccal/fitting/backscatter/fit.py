@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
-from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_rays
+from udccal.fitting.backscatter.checks import check_grid
+from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_rays, grid_step
 from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
@@ -68,7 +69,11 @@ def fit_backscatter(
     Returns:
         The term, its estimates in the units of their names, and its posterior. Data that cannot be fitted give a status
         and a note instead of an exception.
+
+    Raises:
+        FitError: when the data's grid is not that of the rig's sensor.
     """
+    check_grid(data.shots, grid_step(rig), rig)
     rules = rules or BackscatterRules()
     keep = data.shots.clipped.mean(axis=(1, 2, 3))[1:-1] <= rules.most_clipped
     if (unusable := _unusable(data.shots, keep, rules)) is not None:
