@@ -15,12 +15,24 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
+from udccal.errors import FitError, found_instead
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.engine.robust import Huber
 from udccal.result import FitStatus
 
 HUBER: Final = Huber()
 Crops = Float[np.ndarray, "shots rows columns"]
+# Kinds of numbers, and the shape for each shot; None is that of the rates.
+_ARRAYS: Final[dict[str, tuple[str, tuple[int, ...] | None]]] = {
+    "centre_px": ("fiu", (2,)),
+    "origin_px": ("iu", (2,)),
+    "position": ("iu", ()),
+    "disc_px": ("fiu", ()),
+    "rate": ("fiu", None),
+    "weight": ("fiu", None),
+    "channel": ("iu", None),
+    "noise_per_rate": ("fiu", None),
+}
 
 
 @final
@@ -119,6 +131,9 @@ class Shots:
         rate: e-/s; weight: 1 / sigma^2 in (e-/s)^-2, 0 where nothing is known; channel: 0, 1, 2 for R, G, B.
         noise_per_rate: derivative of sigma^2 by the rate, in e-/s. A sample that noise has made darker has too small
             a measured sigma, and a fit with that sigma would be too dark.
+
+    Raises:
+        FitError: when arrays do not go together, or a number cannot be. Where nothing is known, rates may be anything.
     """
 
     centre_px: Float[np.ndarray, "shots 2"]
@@ -130,6 +145,40 @@ class Shots:
     channel: Int[np.ndarray, "shots rows columns"]
     noise_per_rate: Crops
 
+    def __post_init__(self) -> None:
+        crops: tuple[int, ...] = getattr(self.rate, "shape", ())
+        if len(crops) != 3 or not crops[1] % 2 or not crops[2] % 2:
+            found = found_instead(self.rate)
+            raise FitError(
+                f"Expected rates of shots x odd rows x odd columns, found {found}. Crop about a middle sample."
+            )
+        for name, (kinds, shape) in _ARRAYS.items():
+            array, expected = getattr(self, name), crops if shape is None else (crops[0], *shape)
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds or array.shape != expected:
+                numbers = f"{name} as an array of {'real' if 'f' in kinds else 'whole'} numbers of shape {expected}"
+                raise FitError(f"Expected {numbers}, found {found_instead(array)}. Give each shot its own.")
+        positions = np.unique(self.position)
+        if not np.array_equal(positions, np.arange(len(positions))):
+            raise FitError(f"Expected positions without gaps, found {positions[:8].tolist()}. Number them from 0.")
+        self._check_numbers()
+
+    def _check_numbers(self) -> None:
+        known = self.weight > 0
+        possible = np.isfinite(self.weight) & (self.weight >= 0) & (self.channel >= 0) & (self.channel <= 2)
+        possible &= ~known | (np.isfinite(self.rate) & np.isfinite(self.noise_per_rate) & (self.noise_per_rate >= 0))
+        places = np.isfinite(self.centre_px).all(axis=1) & np.isfinite(self.disc_px) & (self.disc_px >= 0)
+        possible &= places[:, None, None]
+        if not possible.all():
+            shot, row, column = np.argwhere(~possible)[0].tolist()
+            expected = "Expected finite places, rates and noise, weights of 0 or more, and channels 0, 1 and 2"
+            found = f"{np.sum(~possible)} samples without, the first in shot {shot}, row {row}, column {column}"
+            raise FitError(f"{expected}, found {found}. Give weight 0 to samples of which nothing is known.")
+        for name in ("rate", "noise_per_rate"):
+            values = getattr(self, name)
+            # Zero times NaN would be NaN in every sum.
+            if not np.isfinite(values).all():
+                object.__setattr__(self, name, np.where(known, values, 0.0))
+
     @property
     def count(self) -> int:
         """Number of pictures."""
@@ -138,7 +187,7 @@ class Shots:
     @property
     def positions(self) -> int:
         """Number of field positions."""
-        return int(self.position.max()) + 1
+        return len(np.unique(self.position))
 
     @property
     def half(self) -> tuple[int, int]:
@@ -203,7 +252,7 @@ def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:
 @final
 @dataclass(frozen=True)
 class PsfData:
-    """The data of a psf fit: crops, and numbers of pictures captured, of those without an LED, and of clipped ones.
+    """The data of a psf fit: crops, and numbers of pictures captured, without an LED, clipped, and of unknown samples.
 
     Crops may be wider than the fit's windows: the kernel's support needs all of them. There are none where no picture
     can be used. ``doubted`` has a sentence for each picture whose bracket contradicts the noise model.
@@ -214,6 +263,7 @@ class PsfData:
     dark: int = 0
     clipped: int = 0
     doubted: tuple[str, ...] = ()
+    unknown: int = 0
 
     def unfit(self, rules: PsfRules) -> tuple[FitStatus, str] | None:
         """Return why these data cannot be fitted, or None."""
@@ -223,9 +273,18 @@ class PsfData:
         if self.dark > most:
             return FitStatus.TOO_DARK, f"{self.dark} of {self.taken} pictures show no LED."
         if self.shots is not None and self.shots.positions < rules.least_positions:
+            seen = "have a sample of which something is known" if self.unknown else "were captured"
             needed = f"{rules.least_positions} are needed at least."
-            return FitStatus.TOO_FEW_DATA, f"{self.shots.positions} field positions were captured; {needed}"
+            return FitStatus.TOO_FEW_DATA, f"{self.shots.positions} field positions {seen}; {needed}"
         return None
+
+    def known(self, rules: PsfRules) -> PsfData:
+        """These data without pictures of which nothing is known in the fit's windows."""
+        if self.shots is None:
+            return self
+        known = np.flatnonzero(self.shots.within(rules.half_px).weight.any(axis=(1, 2)))
+        unknown = self.shots.count - len(known)
+        return replace(self, shots=self.shots.pick(known), unknown=unknown) if unknown else self
 
 
 def left_out(light: Float[np.ndarray, "*shots n"], model_error: float) -> Float[np.ndarray, "*shots n"]:

@@ -69,7 +69,7 @@ def fit_psf(
         and a note instead of an exception.
     """
     rules = rules or PsfRules()
-    start = start_model(rig, geometry, wire, rules)
+    data, start = data.known(rules), start_model(rig, geometry, wire, rules)
     unfit = _unfit(data, rig, rules)
     if unfit is not None or data.shots is None:
         status, note = unfit or (FitStatus.TOO_FEW_DATA, "No field position was captured.")
@@ -293,4 +293,6 @@ def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]
     if data.doubted:
         notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")
     left_out, why = data.dark + data.clipped, f"{data.dark} without an LED, {data.clipped} clipped."
+    if data.unknown:
+        notes.append(f"{data.unknown} pictures were left out: nothing is known of any of their samples.")
     return (*notes, *support, *([f"{left_out} pictures were left out: {why}"] if left_out else []))
