@@ -88,6 +88,14 @@ def _codes(frames: Any) -> Any:
     return frames if isinstance(frames, Averaged) else [frame.astype(np.uint16) for frame in frames]
 
 
+def test_a_stack_shorter_than_all_dark_pairs_contradicts_nothing() -> None:
+    """It has less dark current, and less noise of it, than any of them."""
+    sensor = replace(SENSOR, dark_e_per_s=300.0, read_e=1.5, dark_times_s=(0.5, 1.0, 2.0, 4.0))
+    result = fit_noise(captured(sensor, 3))
+    assert result.status is FitStatus.CONVERGED
+    assert np.abs(errors_in_sigma(result, sensor)).max() < 4.5
+
+
 def test_frames_of_one_code_may_agree() -> None:
     """Noise far below a code: all dark frames are the same, and no copies."""
     data = captured(replace(SENSOR, K_DN_per_e=0.02, read_e=1.0, DSNU_e=0.0, dark_e_per_s=0.0), 3)

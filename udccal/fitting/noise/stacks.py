@@ -38,21 +38,22 @@ def _dark_stack(data: NoiseMoments) -> Iterator[str]:
     mean, usual = float(stack.mean_DN.mean()), float(np.interp(stack.exposure_s, times, means))
     noise = float(np.interp(stack.exposure_s, times, [of.temporal_DN2 for of in pairs]))
     drift = abs(usual - float(means.min())) + 3.0 * float(np.sqrt(noise + rounding))
-    # Beyond the longest exposure, dark current adds what it does within; one exposure does not show how much.
-    beyond, apart, more = max(stack.exposure_s - float(times[-1]), 0.0), float(np.ptp(times)), 0.0
-    if beyond > 0:
-        more = 1.5 * beyond * float(np.ptp(means)) / apart if apart > 0 else np.inf
-    if not usual - drift <= mean <= usual + drift + more:
+    # Outside the pairs' exposures, dark current changes as it does within; one exposure does not show how much.
+    outside, apart = max(stack.exposure_s - float(times[-1]), float(times[0]) - stack.exposure_s, 0.0), np.ptp(times)
+    if outside > 0:
+        drift += 1.5 * outside * float(np.ptp(means) / apart) if apart > 0 else np.inf
+    if abs(mean - usual) > drift:
         why = "some of its frames may be lit" if mean > usual else "black may be subtracted from it"
         found = f"found {mean:.4g} DN: {why}"
         yield f"Expected a dark stack of about {usual:.4g} DN, as the dark pairs, {found}. {_SORT}"
     flat = float(data.flat_stack.mean_DN.mean())
-    if mean > flat + drift and stack.exposure_s <= data.flat_stack.exposure_s:
+    if mean > flat + 3.0 * float(np.sqrt(noise + rounding)) and stack.exposure_s <= data.flat_stack.exposure_s:
         found = f"{mean:.4g} DN and a flat stack of {flat:.4g} DN: they may be exchanged"
         yield f"Expected a dark stack darker than the flat stack, found {found}. {_SORT}"
     if (seen := data.dark_seen) is not None:
-        warmer = max(mean - usual, 0.0) * rough_gain(data, float(means[0]), noise)
-        yield from _unlike("dark", seen.temporal_DN2, 0.5 * noise, 2.0 * (noise + warmer), rounding)
+        more = (mean - usual) * rough_gain(data, float(means[0]), noise)
+        low, high = 0.5 * (noise + min(more, 0.0)), 2.0 * (noise + max(more, 0.0))
+        yield from _unlike("dark", seen.temporal_DN2, low, high, rounding)
 
 
 def _flat_stack(data: NoiseMoments) -> Iterator[str]:
