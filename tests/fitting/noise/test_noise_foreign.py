@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -76,6 +77,33 @@ def test_pixels_one_code_off_in_some_frames_are_not_hot() -> None:
 
     listed = next(one for one in fit_noise(changed(captured(quiet, 3), heated)).outliers if "(hot)" in one.rule)
     assert listed.count == int(hot.sum())
+
+
+def _filtered(kernel: np.ndarray) -> Callable[[np.ndarray, int], np.ndarray]:
+    return lambda codes, _: np.rint(cv2.filter2D(codes.astype(np.float64), -1, kernel))
+
+
+def test_noise_that_neighbours_share_is_told() -> None:
+    """K was 36 sigma too small where 1 % of a pixel goes to each neighbour, a ninth where frames are smoothed."""
+    coupled = np.array([[0, 0.01, 0], [0.01, 0.96, 0.01], [0, 0.01, 0]])
+    for kernel in (coupled, np.full((3, 3), 1 / 9)):
+        result = fit_noise(changed(captured(SENSOR, 3), _filtered(kernel)))
+        assert result.status is FitStatus.POOR_FIT
+        assert noted(result, "Neighbouring pixels share their noise")
+        assert result.estimate("K_DN_per_e").value < 0.34
+
+
+def test_light_that_differs_between_frames_is_no_noise_of_neighbours() -> None:
+    """A panel's pattern times a flicker is in the frames' difference, and so is noise of columns."""
+    down, across = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    panel = 0.1 * np.sin(2 * np.pi * down / 9.3) + 0.1 * np.sin(across / 2.1) - 0.15 * (across / 96 - 1) ** 2
+    rng = np.random.default_rng(7)
+
+    def lifted(codes: np.ndarray, _: int) -> np.ndarray:
+        return np.maximum(codes + np.rint(3 * rng.standard_normal(SHAPE[1])).astype(int), 0)
+
+    data = changed(captured(replace(SENSOR, pattern=panel, flicker=0.05), 3), lifted)
+    assert not noted(fit_noise(data), "Neighbouring pixels")
 
 
 def test_a_glow_in_one_corner_is_part_of_the_dark_current() -> None:

@@ -46,6 +46,7 @@ class NoiseRules:
             none of the family's distributions.
         most_hits: fraction of pixels that radiation hits at most in a dark pair.
         most_hot: fraction of dark samples that are hot pixels above which a note tells of them.
+        most_shared: change of the gain by noise that neighbours share above which the fit is poor.
         worst_chi2: reduced chi-squared above which the sensor is not what the model says.
     """
 
@@ -64,6 +65,7 @@ class NoiseRules:
     foreign_sigma: float = 3.0
     most_hits: float = 1e-4
     most_hot: float = 1e-3
+    most_shared: float = 0.05
     worst_chi2: float = 6.0
 
 

@@ -14,7 +14,7 @@ from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.noise.codes import start_values
 from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
-from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain
+from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain, shared_by_neighbours
 from udccal.fitting.noise.moments import NoiseMoments, bins, reduced, stacked
 from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import Pattern, prnu, rough_median
@@ -182,7 +182,9 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     bent_too_far = abs(float(fit.values[2])) * max(curve.ceiling_DN - dark.black_DN, 1.0) >= 0.999 * rules.most_bent
     converged = fit.converged and (dark.fit.converged or dark.foreign)
     status = FitStatus.CONVERGED if converged else FitStatus.NOT_CONVERGED
-    if fit.misfit.ratio > rules.worst_chi2 or bent_too_far:
+    shared = shared_by_neighbours(data, curve)
+    linked = shared.found and abs(shared.gain_factor - 1) > rules.most_shared
+    if fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked:
         status = FitStatus.POOR_FIT
     shown = len(NAMES) - (not fit.order.curved)
     terms = (dark.row_DN2, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)

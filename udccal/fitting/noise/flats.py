@@ -15,6 +15,7 @@ from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.noise.codes import excess_kurtosis, smeared, standard_cdf
 from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.moments import Moments, NoiseMoments, stacked
+from udccal.fitting.noise.neighbours import Shared, pooled
 from udccal.fitting.noise.transfer import DarkVariance, Five, Grid, Levels, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]
@@ -94,6 +95,13 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
         far_better = found.fit.misfit.ratio > 2 and narrow.fit.misfit.ratio < 0.5 * found.fit.misfit.ratio
         found = narrow if far_better else replace(found, apart=narrow.values - found.values)
     return found
+
+
+def shared_by_neighbours(data: NoiseMoments, curve: Curve) -> Shared:
+    """The noise of light that neighbours share: that of flats inside the range, with more noise than the read noise."""
+    dark = min(of.temporal_DN2 for of in data.dark_moments)
+    inside = zip(data.flats, curve.inside.usable, strict=False)
+    return pooled(of.shared for of, usable in inside if usable.any() and of.temporal_DN2 > 4 * dark)
 
 
 def full_bins(data: NoiseMoments, dark: DarkTerms) -> Bins:

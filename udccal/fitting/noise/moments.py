@@ -29,6 +29,7 @@ from udccal.fitting.noise.data import (
     checked_average,
     loaded,
 )
+from udccal.fitting.noise.neighbours import Shared, shared_noise
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
 
@@ -61,7 +62,8 @@ class Moments:
     of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
     is the fraction of the samples with the largest code, and ``codes`` the histogram of the first frame. ``outliers``
     were hits, and left out; ``outlier_powers`` are the sums of the second and fourth powers of their differences from
-    the first frame. ``repeated``: some frames are copies of others.
+    the first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``repeated``: some
+    frames are copies of others.
     """
 
     exposure_s: float
@@ -80,6 +82,7 @@ class Moments:
     codes: Int[np.ndarray, " codes"]
     outliers: int
     outlier_powers: tuple[float, float]
+    shared: Shared
     repeated: bool = False
 
     @property
@@ -125,6 +128,7 @@ def reduce_frames(
     width = right.sum(axis=0, dtype=np.float64)
     counts, total = np.outer(down.sum(axis=1), width), np.zeros(first.shape, np.float32)
     outliers, powers, squares = 0, np.zeros(2), np.zeros_like(counts)
+    shared: Shared | None = None
     # Of every frame: its rows' means and its bins' sums less these, as differences from the first frame, and its peak.
     by_row, by_bin, peaks = [np.zeros(height)], [np.zeros_like(counts)], [at_peak(first)]
     for frame in source:
@@ -139,6 +143,7 @@ def reduce_frames(
             difference[hits] = 0.0
         by_row.append(difference.mean(axis=1, dtype=np.float64))
         difference -= by_row[-1][:, None]
+        shared = shared or shared_noise(first, difference, period)
         total += difference
         by_bin.append(binned(difference))
         squares += binned(cv2.multiply(difference, difference))
@@ -175,6 +180,7 @@ def reduce_frames(
         codes=np.bincount(first.ravel()),
         outliers=outliers,
         outlier_powers=(float(powers[0]), float(powers[1])),
+        shared=shared or Shared(),
     )
 
 

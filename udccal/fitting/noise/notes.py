@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.noise.dark import DarkTerms
-from udccal.fitting.noise.flats import Curve
+from udccal.fitting.noise.flats import Curve, shared_by_neighbours
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, rough_median
 from udccal.result import Outliers
@@ -84,6 +84,12 @@ def notes(
         found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
         yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
         yield "PRNU1288 holds for the photon transfer curve as fitted, which the variances do not follow."
+    if (shared := shared_by_neighbours(data, curve)).found:
+        found = f"{shared.along_row:.2g} along rows, {shared.along_column:.2g} along columns"
+        yield (
+            f"Neighbouring pixels share their noise (correlation {found}), as where a camera filters its frames. The "
+            f"true K is about {shared.gain_factor:.3g} times the one found; all numbers in electrons change with it."
+        )
     if curve.fit.order.curved:
         yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."
     if bent_too_far:
