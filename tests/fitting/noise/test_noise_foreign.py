@@ -106,6 +106,17 @@ def test_light_that_differs_between_frames_is_no_noise_of_neighbours() -> None:
     assert not noted(fit_noise(data), "Neighbouring pixels")
 
 
+def test_a_mosaic_that_is_given_as_monochrome_is_told() -> None:
+    """PRNU was 14 to 19 sigma off."""
+    colours = np.tile([[-0.5, 0.0], [0.0, -0.65]], (72, 96))
+    mosaic = captured(replace(SENSOR, pattern=colours), 3)
+    assert noted(fit_noise(mosaic), "Give bayer=True")
+    assert not noted(fit_noise(replace(mosaic, bayer=True)), "bayer")
+    two_gains = np.where(np.arange(SHAPE[0]) % 2, 0.0, 0.03)[:, None] * np.ones(SHAPE)
+    uneven = replace(SENSOR, PRNU=0.05, pattern=two_gains, levels=(0.002, 0.004, 0.006, 0.01), stack_level=0.003)
+    assert not noted(measure(uneven, 3), "bayer")
+
+
 def test_a_glow_in_one_corner_is_part_of_the_dark_current() -> None:
     down, across = np.mgrid[: SHAPE[0], : SHAPE[1]]
     glow = 1 + 50 * np.exp(-(down**2 + across**2) / 30**2)

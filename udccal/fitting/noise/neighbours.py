@@ -1,4 +1,7 @@
-"""Whether neighbouring pixels share their noise, which photons do not: then the gain is not variance over mean."""
+"""Whether neighbouring pixels share their noise, which photons do not, and whether they see different light.
+
+Where they share noise, the gain is not variance over mean; where they see different light, they have a colour mosaic.
+"""
 
 from __future__ import annotations
 
@@ -61,6 +64,18 @@ def pooled(parts: Iterable[Shared]) -> Shared:
         return Shared()
     along_row, along_column = (every[:, :2].T @ every[:, 2] / every[:, 2].sum()).tolist()
     return Shared(along_row, along_column, float(every[:, 2].sum() ** -0.5))
+
+
+def sites_apart(signal_DN: Float32[np.ndarray, "rows columns"]) -> float:
+    """How much the light of the brightest site of 2 x 2 exceeds that of the dimmest, relative; 0 where that is chance.
+
+    The rows in the middle are enough. Rows or columns read out with two gains differ by less than a twentieth.
+    """
+    start = max((len(signal_DN) - _ROWS) // 4, 0) * 2
+    sites = [signal_DN[start + row : start + _ROWS : 2, column::2] for row in (0, 1) for column in (0, 1)]
+    light, spread = np.array([(float(one.mean()), float(one.std()) / one.size**0.5) for one in sites]).T
+    apart = float(np.ptp(light))
+    return apart / float(light.mean()) if apart > max(0.05 * abs(light.mean()), 10.0 * spread.max()) else 0.0
 
 
 def _product(first: Float32[np.ndarray, "rows columns"], second: Float32[np.ndarray, "rows columns"]) -> float:

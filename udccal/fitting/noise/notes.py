@@ -11,6 +11,7 @@ from udccal.fitting.engine.robust import outliers
 from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.flats import Curve, shared_by_neighbours
 from udccal.fitting.noise.moments import NoiseMoments
+from udccal.fitting.noise.neighbours import sites_apart
 from udccal.fitting.noise.patterns import Pattern, rough_median
 from udccal.result import Outliers
 
@@ -58,6 +59,10 @@ def notes(
     if uneven.structure2 > 0:
         found = f"Flats vary by {100 * uneven.structure2**0.5:.2g} % between pixels, but not as white noise does."
         yield f"{found} That counts as light, as a panel's; columns or blotches of the sensor are not in PRNU1288."
+    signal = data.flat_stack.mean_DN.astype(np.float32) - np.float32(dark.black_DN)
+    if data.period == 1 and (apart := sites_apart(signal)) > 0:
+        found = f"The light of the 2 x 2 sites of neighbouring pixels differs by {100 * apart:.2g} %"
+        yield f"{found}: the frames look like a colour mosaic, and PRNU1288 is then wrong. Give bayer=True."
     if dark.foreign:
         yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
     if dark.skewed:
