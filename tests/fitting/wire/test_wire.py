@@ -176,6 +176,17 @@ def test_the_maps_sigma_covers_the_truth(bench: Bench, fitted: FitResult[Wire]) 
 
 
 @pytest.mark.medium
+def test_columns_of_unequal_gain_are_told_and_in_the_maps_sigma(bench: Bench, fitted: FitResult[Wire]) -> None:
+    truth = bench.truth * (1 + 4e-3 * np.random.default_rng(5).standard_normal((1, COLUMNS)))
+    uneven = fit_of(bench, *flat_of(truth, 1))
+    assert any("Columns or rows of the sensor differ by 0." in note for note in uneven.notes)
+    assert not any("Columns or rows" in note for note in fitted.notes)
+    error = 100 * np.sqrt(np.mean((sensor_map(uneven.term, ROWS, COLUMNS) - truth / truth.mean()) ** 2))
+    stated = uneven.diagnostic("wire_map_rms_sigma")
+    assert stated == pytest.approx(error, rel=0.3)
+
+
+@pytest.mark.medium
 def test_no_panel_is_absent(bench: Bench) -> None:
     y, x = np.mgrid[:ROWS, :COLUMNS]
     shading = 1 - 0.2 * ((x / COLUMNS - 0.5) ** 2 + (y / ROWS - 0.5) ** 2)

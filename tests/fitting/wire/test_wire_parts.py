@@ -23,7 +23,7 @@ from udccal.fitting.wire.parameters import (
     shape_vector,
     with_shape,
 )
-from udccal.fitting.wire.report import misfit
+from udccal.fitting.wire.report import Misfits, misfit, misfits
 from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible_harmonics
 from udccal.fitting.wire.search import scan_rows
 from udccal.models.geometry import Geometry
@@ -235,6 +235,42 @@ def test_patterns_are_told_from_noise(pattern: float, found: bool) -> None:
     else:
         assert left.sigma == 0.0
         assert left.test.p_value > 1e-3
+
+
+def misfits_with(structure: np.ndarray, variance: float = 1.0) -> Misfits:
+    """What residuals of the ideal map show where the sensor's response has this structure besides noise of 0.4 %."""
+    wire = ideal_wire(GEOMETRY, START, HARMONICS)
+    pixels = even_pixels(wire, 4e-3, 5)
+    y, x = np.divmod(pixels.place, COLUMNS)
+    pixels = eqx.tree_at(lambda p: p.value, pixels, pixels.value * (1 + structure[y, x]))
+    judged = judge(wire, pixels, FlatNoise(np.full(4, 16e-6), np.zeros(4), 0.0, np.full(4, np.inf)))
+    with jax.enable_x64(True):
+        return misfits(judged, wire, 1e-5, True, variance, RULES)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"), [(0.0, 3e-3), (3e-3, 0.0), (2e-3, 2e-3)], ids=["columns", "rows", "columns and rows"]
+)
+def test_lines_of_the_sensor_that_differ_are_part_of_the_model_error(rows: float, columns: float) -> None:
+    rng = np.random.default_rng(6)
+    lines = rows * rng.standard_normal((ROWS, 1)) + columns * rng.standard_normal((1, COLUMNS))
+    found = misfits_with(lines)
+    assert found.lines.test.found
+    assert found.lines.sigma == pytest.approx(np.hypot(rows, columns), rel=0.25)
+    assert found.sigma >= found.lines.sigma
+    assert found.excess == 0
+
+
+def test_noise_shows_no_lines() -> None:
+    found = misfits_with(np.zeros((ROWS, COLUMNS)))
+    assert not found.found
+    assert found.sigma == 0
+
+
+def test_residuals_of_a_poor_fit_are_all_in_the_model_error() -> None:
+    # Neither the panel's period nor lines explain this.
+    blotches = 8e-3 * np.random.default_rng(7).standard_normal((ROWS, COLUMNS))
+    assert misfits_with(blotches, 4.0).sigma == pytest.approx(8e-3, rel=0.1)
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])

@@ -21,7 +21,7 @@ from udccal.fitting.wire.columns import best_of_columns, likely_columns
 from udccal.fitting.wire.data import Pixels, WireData, flat_noise, pixels_at, sample_pixels
 from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, values_at, weighed_at
 from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
-from udccal.fitting.wire.report import Joint, misfit, rms, wire_result
+from udccal.fitting.wire.report import Joint, misfits, rms, wire_result
 from udccal.fitting.wire.rules import SOLVER, WireRules, ideal_wire
 from udccal.fitting.wire.search import Descent, Found, Search
 from udccal.fitting.wire.weak import omitted, strengths_of, tied_sigma, unseen
@@ -68,8 +68,9 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
         tested = weighed_at(joint.parameters, joint.x, others, noise)
     joint = replace(joint, x=mean_one(joint.parameters, joint.x, shape))
     jacobian, wire = map_jacobian(joint.parameters, joint.x, shape), joint.parameters.wire(joint.x)
-    off = misfit(tested, wire if joint.parameters.panel else None, jacobian.sigma(joint.cov), held_out)
-    if off.test.found:
+    panel = wire if joint.parameters.panel else None
+    off = misfits(tested, panel, jacobian.sigma(joint.cov), held_out, joint.variance, rules)
+    if off.found:
         joint = replace(joint, cov=clustered_cov(joint.cov, joint.last.problem.sums(joint.x)[1] / joint.variance))
     if joint.parameters.panel:
         missing = omitted(data.start, wire, joint.seen, rules)

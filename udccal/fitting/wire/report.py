@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, Int
 from scipy.spatial.transform import Rotation
 
 from udccal.fitting.engine.gaussian import Posterior
-from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_sigma, sharper
+from udccal.fitting.engine.misfit import MisfitTest, chi2_test, excess_sigma, sharper
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.wire.data import BLOCK, Pixels, Weighed
@@ -33,30 +33,93 @@ class Misfit:
     test: MisfitTest
 
 
+@final
+@dataclass(frozen=True)
+class Misfits:
+    """What residuals show of the map's model error: a pattern in the panel's period, and lines of the sensor.
+
+    ``excess`` is the RMS of residuals beyond noise where they are so large that the fit is poor, else 0.
+    """
+
+    pattern: Misfit
+    lines: Misfit
+    excess: float
+
+    @property
+    def found(self) -> bool:
+        """Whether chance does not explain the residuals' means."""
+        return self.pattern.test.found or self.lines.test.found
+
+    @property
+    def sigma(self) -> float:
+        """Relative model error of the map."""
+        return max(float(np.hypot(self.pattern.sigma, self.lines.sigma)), self.excess)
+
+
+@final
+@dataclass(frozen=True)
+class Relative:
+    """Residuals relative to the expected signal, their weights, and their variance in units of the noise's."""
+
+    values: Float[np.ndarray, " n"]
+    weight: Float[np.ndarray, " n"]
+    scale: float
+
+    @classmethod
+    def of(cls, tested: Weighed) -> Relative:
+        """The residuals of a sample; pixels without a weight have none here."""
+        pixels, expected = tested.pixels, tested.expected
+        used = (pixels.weight > 0) & (expected > 0)
+        values = np.where(used, pixels.value / np.where(used, expected, 1.0) - 1, 0.0)
+        weight = np.where(used, pixels.weight * expected**2, 0.0)
+        scale = float(np.sum(weight * values**2)) / max(int(used.sum()), 1)
+        return cls(values, weight, max(scale, LEAST_VARIANCE))
+
+    def means(self, group: Int[np.ndarray, " n"], statistical: float, held_out: bool) -> Misfit:
+        """Test the means of groups against chance.
+
+        ``held_out`` pixels show the fit's ``statistical`` errors as well; these are accounted for.
+        """
+        full = np.bincount(group, self.weight > 0) >= 4
+        total = np.bincount(group, self.weight)[full]
+        mean = np.bincount(group, self.weight * self.values)[full] / total
+        noise = self.scale / total
+        noise = noise + statistical**2 if held_out else np.maximum(noise - statistical**2, 0.1 * noise)
+        test = chi2_test(float(np.sum(mean**2 / noise)), float(len(mean)))
+        return Misfit(excess_sigma(mean**2, noise, np.ones(len(mean)), float(len(mean))), test)
+
+    def beyond_noise(self) -> float:
+        """RMS of the residuals less that of the noise."""
+        mean_square = float(np.sum(self.values**2)) / max(int(np.count_nonzero(self.weight)), 1)
+        return float(np.sqrt(mean_square * max(1 - 1 / self.scale, 0.0)))
+
+
 def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: bool) -> Misfit:
     """Test means over bins of the rows' and the columns' period, tile by tile, against chance.
 
     Noise has no pattern; a misfit has. ``wire`` gives the phase of each ray in the period; without a panel, bins are
-    parts of a tile. ``held_out`` pixels show the fit's ``statistical`` errors as well; these are accounted for.
+    parts of a tile. See ``Relative.means`` for the others.
     """
-    pixels, expected = tested.pixels, tested.expected
-    used = (pixels.weight > 0) & (expected > 0)
-    relative = np.where(used, pixels.value / np.where(used, expected, 1.0) - 1, 0.0)
-    weight = np.where(used, pixels.weight * expected**2, 0.0)
-    scale = max(float(np.sum(weight * relative**2)) / max(int(used.sum()), 1), LEAST_VARIANCE)
-    tests, sizes = [], []
+    relative = Relative.of(tested)
     # Bins of a period of the rows and of the columns, once finer in the one, once in the other.
-    for down, across in ((12, 3), (3, 12)):
-        bins = _bins(pixels, wire, down, across)
-        full = np.bincount(bins, used) >= 4
-        total = np.bincount(bins, weight)[full]
-        mean = np.bincount(bins, weight * relative)[full] / total
-        noise = scale / total
-        noise = noise + statistical**2 if held_out else np.maximum(noise - statistical**2, 0.1 * noise)
-        tests.append(chi2_test(float(np.sum(mean**2 / noise)), float(len(mean))))
-        sizes.append(excess_sigma(mean**2, noise, np.ones(len(mean)), float(len(mean))))
-    test = sharper(*tests) if len(mean) else NO_TEST
-    return Misfit(sizes[int(np.argmin([one.p_value for one in tests]))] if test.found else 0.0, test)
+    binned = (_bins(tested.pixels, wire, down, across) for down, across in ((12, 3), (3, 12)))
+    found = [relative.means(bins, statistical, held_out) for bins in binned]
+    test = sharper(*(one.test for one in found))
+    return Misfit(min(found, key=lambda one: one.test.p_value).sigma if test.found else 0.0, test)
+
+
+def misfits(
+    tested: Weighed, wire: Wire | None, statistical: float, held_out: bool, variance: float, rules: WireRules
+) -> Misfits:
+    """All that residuals show; ``variance`` is that of the fit's residuals in units of the noise's."""
+    relative = Relative.of(tested)
+    # Columns and rows of the sensor, each by the place of its pixels.
+    sides = (np.unique(side, return_inverse=True)[1] for side in tested.pixels.scaled.T)
+    columns, rows = (relative.means(side, statistical, held_out) for side in sides)
+    test = sharper(columns.test, rows.test)
+    lines = Misfit(float(np.hypot(columns.sigma, rows.sigma)) if test.found else 0.0, test)
+    excess = relative.beyond_noise() if variance > rules.worst_variance else 0.0
+    return Misfits(misfit(tested, wire, statistical, held_out), lines, excess)
 
 
 def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.ndarray, " n"]:
@@ -105,7 +168,7 @@ def rms(values: Float[np.ndarray, "..."]) -> float:
 def wire_result(
     joint: Joint,
     cov: Float[np.ndarray, "n n"],
-    found: Misfit,
+    found: Misfits,
     left_out: float,
     map_sigma: Float32[np.ndarray, "1 down across"],
     posterior: Posterior[Wire],
@@ -131,7 +194,8 @@ def wire_result(
         ("wire_map_rms_sigma", 100 * rms(map_sigma), "%"),
         ("wire_map_model_sigma", 100 * float(np.hypot(found.sigma, left_out)), "%"),
         ("harmonics_left_out", 100 * left_out, "%"),
-        ("residual_pattern_p_value", found.test.p_value, "1"),
+        ("residual_pattern_p_value", found.pattern.test.p_value, "1"),
+        ("residual_lines_p_value", found.lines.test.p_value, "1"),
         ("modulation_peak_to_peak", 100 * float(np.ptp(values_at(term, few)[0])), "%"),
         ("harmonics", float(len(term.harmonics)), "1"),
         ("parameters", float(joint.parameters.linear), "1"),
@@ -178,7 +242,7 @@ def _status(joint: Joint, rules: WireRules) -> FitStatus:
     return FitStatus.CONVERGED if joint.last.solution.converged else FitStatus.NOT_CONVERGED
 
 
-def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> Iterator[str]:
+def _notes(joint: Joint, found: Misfits, left_out: float, rules: WireRules) -> Iterator[str]:
     if joint.parameters.panel:
         prior = joint.last.problem.prior
         off = (prior.root @ (joint.x - prior.mean))[joint.parameters.linear :]
@@ -197,15 +261,23 @@ def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> It
                 f"These flats are too noisy to tell: rows may modulate by {100 * left_out:.2g} % unseen, which "
                 "the sigmas include. Average more frames, or expose longer."
             )
-    if found.test.found:
+    if (pattern := found.pattern).test.found:
         yield (
-            f"The residuals are patterned (p = {found.test.p_value:.1g}): the model may be {100 * found.sigma:.3f} % "
-            "off, which the sigmas include."
+            f"The residuals are patterned (p = {pattern.test.p_value:.1g}): the model may be {100 * pattern.sigma:.3f} "
+            "% off, which the sigmas include."
+        )
+    if (lines := found.lines).test.found:
+        yield (
+            f"Columns or rows of the sensor differ by {100 * lines.sigma:.2g} % (p = {lines.test.p_value:.1g}), which "
+            "the map lacks and the sigmas include. Check the gains of the sensor's columns, and the light for stripes."
         )
     if joint.impossible:
         yield "An opening came out wider than its period: check panel, pitch and lens in the rig description."
     if joint.variance > rules.worst_variance:
-        yield "Look at the residual map for dust, glare or uneven light; check PRNU and the rig description."
+        yield (
+            "Look at the residual map for dust, glare or uneven light; check PRNU and the rig description. The sigmas "
+            f"take all {100 * found.excess:.2g} % by which residuals exceed noise for an error of the map."
+        )
     elif not joint.last.solution.converged:
         yield "Capture more flats, or give the fit more pixels."
 
