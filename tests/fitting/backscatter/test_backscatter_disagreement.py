@@ -1,4 +1,4 @@
-"""Error bars of kernels that are not the same all over the sensor."""
+"""Error bars of kernels that are not the same all over the sensor, and of pictures of unequal brightness."""
 
 from __future__ import annotations
 
@@ -41,3 +41,20 @@ def test_parts_of_the_sensor_that_disagree_widen_the_error_bars_and_are_told() -
     assert sigma["apart"] > 3 * sigma["same"]
     # The mean of both halves, within what each half says.
     assert abs(apart.estimate("offset_x_px").value - 0.1) < 3 * sigma["apart"]
+
+
+@pytest.mark.medium
+def test_pictures_of_unequal_brightness_are_told_and_in_the_error_bars() -> None:
+    data, truth = _shots(0.1, 4), world_at(prior_of(RIG).mean, RIG, np.full((3, 1, 1), 2e4)).term
+    brightness = 1 + 3e-3 * np.random.default_rng(8).standard_normal((len(data.shots.rate), 1, 1, 1))
+    uneven = replace(data, shots=replace(data.shots, rate=data.shots.rate * brightness))
+    sound, told = (fit_backscatter(one, GEOMETRY, RIG, RULES) for one in (data, uneven))
+    assert not any("brightness differs" in note for note in sound.notes)
+    assert any("The panel's brightness differs by 0." in note for note in told.notes)
+    assert not any("different kernels" in note for note in told.notes)
+    gamma = told.estimate("gamma")
+    assert abs(gamma.value - float(np.asarray(truth.gamma))) < 4 * gamma.sigma
+    assert gamma.sigma > 5 * sound.estimate("gamma").sigma
+    # The term's own error bars have it, too.
+    by_term = told.sigma_of(lambda term: np.asarray(term.gamma).reshape(1))
+    assert by_term[0] == pytest.approx(gamma.sigma, rel=0.2)

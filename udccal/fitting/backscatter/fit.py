@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.linalg import block_diag
 
 from udccal.fitting.backscatter.checks import check_grid
 from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_rays, grid_step
+from udccal.fitting.backscatter.misfits import Brightness, brightness, disagreement, residual_pattern
 from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
@@ -35,7 +36,7 @@ from udccal.fitting.backscatter.parameters import (
 )
 from udccal.fitting.backscatter.solve import BAD_BINS, BAD_PICTURES, Found, Problem, search
 from udccal.fitting.engine.gaussian import Posterior, square_root
-from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, group_means_test, sharper
+from udccal.fitting.engine.misfit import MisfitTest
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.nominal import absent_backscatter
@@ -104,18 +105,20 @@ def _unusable(
 def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped: list[str]) -> FitResult[Backscatter]:
     """Return the fit as a result; ``clipped`` names the pictures that were left out before it."""
     fitted, used, problem = found.fitted, found.fitted.used, found.problem
-    rest, wider = residual_pattern(found), disagreement(found)
+    rest, bright = residual_pattern(found), brightness(found)
+    wider = disagreement(found, bright.errors)
     values = value_moments(found, rest.inflation)
     # A pattern has widened all parameters already.
     scale = np.sqrt(np.maximum(wider / rest.inflation, 1.0))
-    cov = values.cov * np.outer(scale, scale)
+    cov = values.cov * np.outer(scale, scale) + scaled(bright.cov, value_slope(fitted.found.x))
     # Pictures give lengths in panel pixels only: lengths change with the pitch.
     pitch, lengths = rig.panel.pitch_mm, np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]) * values.mean
     cov += (pitch.tolerance / pitch.value) ** 2 * np.outer(lengths, lengths)
     scale = np.where(np.arange(len(NAMES)) == PUPIL, 1 / footprint_per_pupil(rig), 1.0)
     cov *= np.outer(scale, scale)
     term_at, (status, advice) = TermAt.of(data, found), _status(found)
-    posterior = term_at.posterior(linear_cov(found, np.maximum(wider, rest.inflation)))
+    by_brightness = scaled(bright.cov, linear_slope(fitted.found.x))
+    posterior = term_at.posterior(linear_cov(found, np.maximum(wider, rest.inflation)) + by_brightness)
     nominal = values_of(problem.prior.mean)
     priors = priors_of(NAMES, nominal * scale, problem.prior.sigma * value_slope(nominal) * scale)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
@@ -138,7 +141,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
             Diagnostic("frame_scatter_over_noise", scatter, "1"),
             Diagnostic("pictures", float(found.good[1:-1].sum()), "1"),
         ),
-        notes=(*advice, *_notes(found, rest, wider, scatter, clipped)),
+        notes=(*advice, *_notes(found, rest, bright, wider, scatter, clipped)),
         outliers=_outliers(found, data, clipped),
         # The eliminated mask reduces the residuals' variance; the factor corrects for it.
         residuals=residual_sample(
@@ -149,6 +152,11 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
         # Of the light of white by the frames' noise, at the fitted kernels.
         map_sigma=np.asarray(coarse(term_at.mask[1] ** -2.0, _CELLS) ** -0.5, dtype=np.float32),
     )
+
+
+def scaled(cov: Float[np.ndarray, "n n"], slope: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+    """Return the covariance of numbers with these derivatives by the parameters of ``cov``."""
+    return np.asarray(cov * np.outer(slope, slope))
 
 
 def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
@@ -183,7 +191,9 @@ def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
     return FitStatus.CONVERGED, ()
 
 
-def _notes(found: Found, rest: MisfitTest, wider: Vector, scatter: float, clipped: list[str]) -> tuple[str, ...]:
+def _notes(
+    found: Found, rest: MisfitTest, bright: Brightness, wider: Vector, scatter: float, clipped: list[str]
+) -> tuple[str, ...]:
     notes = [f"{len(clipped)} clipped pictures left out."] if clipped else []
     if found.model_error > 0:
         notes.append(f"Ratios to white are modelled to {found.model_error:.2%} only; that counts as noise.")
@@ -191,6 +201,11 @@ def _notes(found: Found, rest: MisfitTest, wider: Vector, scatter: float, clippe
         notes.append(
             f"Residuals have a pattern (p = {rest.p_value:.1g}); all sigmas are {np.sqrt(rest.inflation):.1f} times "
             "those of independent ones."
+        )
+    if bright.sigma > 0:
+        notes.append(
+            f"The panel's brightness differs by {100 * bright.sigma:.2g} % from picture to picture (p = "
+            f"{bright.test.p_value:.1g}), which sigmas include. Hold it, and expose for whole periods of its refresh."
         )
     if (most := float(np.sqrt(wider.max()))) > 1:
         notes.append(
@@ -222,47 +237,6 @@ def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[
         *outliers("bins with clipped samples", named(~usable)),
         *BAD_BINS.listed(named(outlying & ~bad[:, None, None])),
     )
-
-
-def residual_pattern(found: Found) -> MisfitTest:
-    """Test whether residuals of a shot and colour have the same sign over parts of the sensor or all of it."""
-    best, used, cells = found.fitted.best, found.fitted.used, _cells(found)[0]
-    groups = np.arange(used[..., 0].size).reshape(*used.shape[:2], 1) * (cells.max() + 1)
-    scale = max(best.chi2 / found.dof, 1.0) * found.dof / max(used.sum(), 1)
-    tests = (
-        group_means_test(best.z.ravel(), (groups + parts).ravel(), used.ravel(), scale) for parts in (cells, 0 * cells)
-    )
-    return sharper(*tests)
-
-
-def _cells(found: Found) -> tuple[Int[np.ndarray, " n"], ...]:
-    """Return the part of the sensor in which each position lies: its cell, its band of rows and of columns."""
-    places, across = found.places, found.problem.rules.cells
-    low, high = places.min(axis=0), places.max(axis=0)
-    column, row = np.minimum((places - low) / np.maximum(high - low, 1e-9) * across, across - 1).astype(int).T
-    return row * across + column, row, column
-
-
-def disagreement(found: Found) -> Vector:
-    """Factors of the parameters' variances, above 1 where parts of the sensor ask for different values.
-
-    A kernel that is wrong by an amount that changes slowly over the field hardly shows in residuals, which have the
-    signs of the pictures' edges. But it moves a parameter by different amounts in different places, and then by more
-    than independent residuals do. Each part moves the parameters by its score (``clustered_cov``). Where chance is no
-    explanation for the scatter of any parameter, the model is refuted, and the scatter of every parameter is the
-    measure of its sigma. So few parts tell it roughly: errors over it follow Student's t, whose variance is larger.
-    """
-    solved, free, shape = found.fitted.found, found.fitted.order.free, found.fitted.ratio.shape
-    errors, jacobian = found.problem.errors_at(found.fitted.best.weight)(solved.x)
-    shifts, factors, tests = (jacobian @ solved.cov)[:, free], np.ones(len(free)), [NO_TEST]
-    dof = found.problem.rules.cells**2 - 1
-    for parts in _cells(found):
-        member = 1.0 * (np.broadcast_to(parts, shape).ravel() == np.unique(parts)[:, None])
-        square, expected = (member @ (shifts * errors[:, None])) ** 2, np.maximum(member @ shifts**2, 1e-300)
-        tests += [chi2_test(float(one), len(member) - 1.0) for one in (square / expected).sum(axis=0)]
-        wider = dof / (dof - 2) * square.sum(axis=0) / expected.sum(axis=0)
-        factors[free] = np.maximum(factors[free], wider)
-    return factors if sharper(*tests).found else np.ones(len(free))
 
 
 def value_moments(found: Found, inflation: float) -> Moments:
