@@ -63,7 +63,7 @@ def test_another_shading_leaves_a_pattern(true: World, data: BackscatterData) ->
 
 
 def test_a_session_without_white_cannot_be_judged(true: World, data: BackscatterData) -> None:
-    none = replace(data, shots=data.shots.part(slice(0, 0)))
+    none = replace(data, shots=data.shots.part(slice(0, 0)), shown=data.shown[:0], names=())
     assert failed(judge_backscatter(none, fitted("backscatter", true.term), ValidationLimits())) == {"captures"}
 
 
