@@ -94,8 +94,9 @@ def calibrate(
     from udccal.sessions.changes import Exchanged
 
     check_replaceable(profile)
-    for folder in (profile.parent, *(() if log is None else (log.parent,))):
-        check_writable(folder)
+    check_writable(profile.parent)
+    if log is not None:
+        check_writable(log.parent)
     if session.resolve().is_relative_to(profile.resolve()):
         raise typer.BadParameter("The profile is replaced as a whole: give --session a folder that is not within it.")
     wanted = Wanted(

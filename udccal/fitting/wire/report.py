@@ -100,9 +100,12 @@ def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: boo
     Noise has no pattern; a misfit has. ``wire`` gives the phase of each ray in the period; without a panel, bins are
     parts of a tile. See ``Relative.means`` for the others.
     """
-    relative = Relative.of(tested)
+    return _pattern(Relative.of(tested), tested.pixels, wire, statistical, held_out)
+
+
+def _pattern(relative: Relative, pixels: Pixels, wire: Wire | None, statistical: float, held_out: bool) -> Misfit:
     # Bins of a period of the rows and of the columns, once finer in the one, once in the other.
-    binned = (_bins(tested.pixels, wire, down, across) for down, across in ((12, 3), (3, 12)))
+    binned = (_bins(pixels, wire, down, across) for down, across in ((12, 3), (3, 12)))
     found = [relative.means(bins, statistical, held_out) for bins in binned]
     test = sharper(*(one.test for one in found))
     return Misfit(min(found, key=lambda one: one.test.p_value).sigma if test.found else 0.0, test)
@@ -119,7 +122,7 @@ def misfits(
     test = sharper(columns.test, rows.test)
     lines = Misfit(float(np.hypot(columns.sigma, rows.sigma)) if test.found else 0.0, test)
     excess = relative.beyond_noise() if variance > rules.worst_variance else 0.0
-    return Misfits(misfit(tested, wire, statistical, held_out), lines, excess)
+    return Misfits(_pattern(relative, tested.pixels, wire, statistical, held_out), lines, excess)
 
 
 def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.ndarray, " n"]:
