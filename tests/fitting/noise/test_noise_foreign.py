@@ -56,12 +56,27 @@ def test_dark_current_that_differs_from_pixel_to_pixel_is_its_mean(shape: float)
 def test_hot_pixels_are_told_and_have_no_part_in_the_read_noise() -> None:
     hot = np.where(np.random.default_rng(5).random(SHAPE) < 0.01, 50.0, 1.0)
     result = measure(replace(SENSOR, dark_pattern=hot), 3)
-    assert noted(result, "far from the others (hot pixels)")
+    assert noted(result, "far from the others (hot or dead pixels)")
     for name, truth in (("black_DN", 64.0), ("dark_current_e_per_s", 40.0), ("sigma_d_e", 4.0)):
         assert abs(z(result, name, truth)) < 4.5, name
     # With codes as coarse as twice the read noise, flats alone show the hot pixels' offsets.
     coarse = measure(replace(SENSOR, dark_pattern=hot, K_DN_per_e=0.1, read_e=1.5), 3)
     assert noted(coarse, "hot pixels, which rounding hides")
+
+
+@pytest.mark.parametrize("where", [np.s_[[10, 70]], np.s_[:, [10, 70]]])
+@pytest.mark.parametrize("offset_DN", [-4095, 300])
+def test_dead_lines_and_fixed_offsets_have_no_part_in_the_read_noise(where: slice, offset_DN: int) -> None:
+    """They were taken for light: sigma_d was 12 sigma too large beside dead rows, 39 too small beside bright ones."""
+
+    def broken(codes: np.ndarray, _: int) -> np.ndarray:
+        codes[where] = np.clip(codes[where] + offset_DN, 0, 4095)
+        return codes
+
+    result = fit_noise(changed(captured(SENSOR, 3), broken))
+    assert noted(result, "far from the others (hot or dead pixels)")
+    for name, truth in (("K_DN_per_e", 0.36), ("black_DN", 64.0), ("dark_current_e_per_s", 40.0), ("sigma_d_e", 4.0)):
+        assert abs(z(result, name, truth)) < 4.5, name
 
 
 def test_pixels_one_code_off_in_some_frames_are_not_hot() -> None:

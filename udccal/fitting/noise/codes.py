@@ -76,17 +76,23 @@ class DarkPair:
         return np.asarray(self.centres_DN[:, None] - self.centres_DN)
 
 
-def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:
-    """Joint histogram over a window of codes around the median; codes beyond it are left out."""
+def dark_window(first: Codes, q_DN: int) -> tuple[int, int]:
+    """Return the median of a dark frame, and how far usual codes reach about it, both in steps of the converter."""
     low, less, middle, more, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 16.0, 50.0, 84.0, 98.0])
     # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
     half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
     usual = int(np.ceil(3.9 * (more - less) / q_DN)) + 4
-    # At most about 160 groups a side: a wide window loses nothing by coarser ones, unless hot pixels made it wide.
-    half = usual if half > max(2 * usual, 80) else half
+    # Unless hot pixels made it wide.
+    return round(middle / q_DN), usual if half > max(2 * usual, 80) else half
+
+
+def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:
+    """Joint histogram over a window of codes around the median; codes beyond it are left out."""
+    middle, half = dark_window(first, q_DN)
+    # At most about 160 groups a side: a wide window loses nothing by coarser ones.
     group = max(1, int(np.ceil((2 * half + 1) / 160)))
-    start = max(round(middle / q_DN) - half, 0)
-    codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
+    start = max(middle - half, 0)
+    codes = min((middle + half - start) // group, (top_code // q_DN - start) // group) + 1
     # One more group takes all that lies outside the window.
     side = codes + 1
     group_of = (np.arange(65536) // q_DN - start) // group

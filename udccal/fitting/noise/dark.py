@@ -68,7 +68,7 @@ def fit_dark_terms(
     single = Quantity(read.value + shot + data.rounding_DN2, read.variance)
     if seen := data.dark_seen:
         # Its own frames say what noise the average has, whatever the distribution.
-        single = Quantity(seen.temporal_DN2, 2 * seen.temporal_DN2**2 / float(seen.dof.sum()))
+        single = Quantity(seen.near_DN2, 2 * seen.near_DN2**2 / float(seen.dof.sum()))
     offsets = _offsets(data, codes, single)
     levels = dark_levels(data, fit, pairs, codes.white, row_DN2, single.value, offsets, curvature)
     return DarkTerms(
@@ -142,11 +142,11 @@ def _read_noise(data: NoiseMoments, codes: _Codes, pairs: Means, K_DN_per_e: flo
     """The read noise's variance, and ``DarkTerms.foreign``."""
     fit, rules = codes.fit, data.rules
     rate, read, variance = float(fit.values[1]), float(fit.values[2]), float(fit.cov[2, 2])
-    drifts = (pairs.rate_DN_per_s if pairs.skewed else rate) * pairs.times_s + pairs.hot_DN
+    drifts = (pairs.rate_DN_per_s if pairs.skewed else rate) * pairs.times_s
     expected = [read + data.rounding_DN2 + K_DN_per_e * max(drift, 0.0) for drift in drifts]
     if not codes.white:
         expected = _coded_variances(data.darks, fit, K_DN_per_e, codes.row_DN)
-    more = unexplained_variance(data, expected, rules.most_hits)
+    more = unexplained_variance(data, expected, rules.most_hits, pairs.skewed)
     if abs(more.value) > rules.foreign_sigma * more.variance**0.5:
         # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
         # codes tell of the rest depends on the distribution as well.
@@ -197,17 +197,20 @@ def _coded_variances(pairs: tuple[DarkPair, ...], fit: DarkFit, K_DN_per_e: floa
     return found
 
 
-def unexplained_variance(data: NoiseMoments, expected_DN2: Sequence[float], most_hits: float) -> Quantity:
+def unexplained_variance(
+    data: NoiseMoments, expected_DN2: Sequence[float], most_hits: float, of_all: bool = False
+) -> Quantity:
     """Temporal variance of dark samples, without row noise, less that expected in each pair.
 
     It comes from the differences of the codes, and its sigma from their fourth moment. Differences taken for hits count
     where they are more than ``most_hits`` of all: radiation does not hit so often, so that they are tails of the noise,
-    or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the variance over all pixels).
+    or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the variance over all pixels). Pixels far
+    from the others count only where ``of_all`` is True: hot ones have shot noise, dead ones have none.
     """
     tails = sum(of.outliers for of in data.dark_moments) > most_hits * sum(of.pixels for of in data.dark_moments)
     values, variances = [], []
     for pair, of in zip(data.darks, data.dark_moments, strict=True):
-        value = of.temporal_DN2 + tails * of.outlier_variance_DN2
+        value = (of.temporal_DN2 if of_all else of.near_DN2) + tails * of.outlier_variance_DN2
         fourth = (np.sum(pair.counts * pair.differences_DN**4) + tails * of.outlier_powers[1]) / of.pixels
         values.append(value)
         variances.append(max(fourth / 4 - value**2, value**2) / of.pixels)

@@ -44,14 +44,13 @@ class _Line:
 class Means:
     """Mean signals of the dark pairs; ``skewed``: those of all pixels, as no distribution has them.
 
-    Otherwise hot pixels outside the histograms have ``hot_DN`` of the mean of all pixels, and ``doubt`` is how far the
-    mean codes would move black and dark current.
+    Otherwise they are those of the histograms, and ``doubt`` is how far the mean codes would move black and dark
+    current.
     """
 
     times_s: PerPair
     means_DN: PerPair
     variances_DN2: PerPair
-    hot_DN: PerPair
     doubt: PerPair
     skewed: bool = False
 
@@ -68,21 +67,21 @@ def dark_means(data: NoiseMoments, fit: DarkFit, row_DN2: float | None) -> Means
     smear the rounding, they tell how far off the fit's mean is.
     """
     times = np.array([pair.exposure_s for pair in data.darks])
-    fitted, nothing = (times, fit.means_DN, fit.variances_DN2), np.zeros(len(times))
+    fitted = times, fit.means_DN, fit.variances_DN2
     if row_DN2 is None and not fit.follows:
-        return Means(*fitted, nothing, np.zeros(2))
+        return Means(*fitted, np.zeros(2))
     codes, dark = np.array([pair.mean_DN for pair in data.darks]), data.dark_moments
-    everywhere = np.array([np.average(of.mean_DN, weights=of.samples) for of in dark])
     by_fit = _Line.through(fit.means_DN, fit.variances_DN2, times)
     if row_DN2 is None:
-        return Means(*fitted, nothing, _Line.through(codes, fit.variances_DN2, times).values - by_fit.values)
+        return Means(*fitted, _Line.through(codes, fit.variances_DN2, times).values - by_fit.values)
     own = np.array([of.temporal_DN2 / (2 * of.pixels) + row_DN2 / (2 * of.height) for of in dark])
     by_codes = _Line.through(codes, own, times)
     doubt = by_codes.values - by_fit.values
     if np.all(np.abs(doubt) <= data.rules.foreign_sigma * np.sqrt(np.diag(by_codes.cov))):
-        return Means(*fitted, everywhere - codes, doubt)
+        return Means(*fitted, doubt)
+    everywhere = np.array([np.average(of.mean_DN, weights=of.samples) for of in dark])
     own += [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
-    return Means(times, everywhere, own, nothing, np.zeros(2), True)
+    return Means(times, everywhere, own, np.zeros(2), True)
 
 
 def _frozen(temporal_codes2: float) -> float:

@@ -205,12 +205,12 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     # Hits were left out of the stack: where tails of the noise were taken for hits, it shows too little.
     if seen is not None and dark.white and not dark.foreign:
         # The tails are the read noise's: rounding and counts of dark current have hardly any.
-        tails = excess_kurtosis(dark.shape.value) * min(read.value, seen.temporal_DN2) ** 2 * (1 - 1 / seen.frames)
-        sigma = float(np.sqrt((2 * seen.temporal_DN2**2 + tails) / float(seen.dof.sum())))
-        # Hot pixels, which are not in the dark current unless it is skewed, have shot noise, too.
-        hot = 0.0 if dark.skewed else float(np.average(seen.mean_DN, weights=seen.samples)) - dark.offsets.mean
-        signal = rate * seen.exposure_s + hot
-        points.append((seen.temporal_DN2 - rounding - K * signal, sigma, signal))
+        # Hot pixels are not in the dark current, unless it is skewed.
+        variance = seen.temporal_DN2 if dark.skewed else seen.near_DN2
+        tails = excess_kurtosis(dark.shape.value) * min(read.value, variance) ** 2 * (1 - 1 / seen.frames)
+        sigma = float(np.sqrt((2 * variance**2 + tails) / float(seen.dof.sum())))
+        signal = rate * seen.exposure_s
+        points.append((variance - rounding - K * signal, sigma, signal))
     values, sigmas, drifts = np.array(points).T
     # An error of black acts on the curve as an error of V0 that is K times as large.
     shifted = K * np.sqrt(float(dark.levels_cov[0, 0]))

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from udccal.errors import FitError, found_instead
-from udccal.fitting.noise.codes import DarkPair, dark_pair
+from udccal.fitting.noise.codes import DarkPair, dark_pair, dark_window
 from udccal.fitting.noise.data import (
     Averaged,
     Codes,
@@ -62,8 +62,9 @@ class Moments:
     of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
     is the fraction of the samples with the largest code, and ``codes`` the histogram of the first frame. ``outliers``
     were hits, and left out; ``outlier_powers`` are the sums of the second and fourth powers of their differences from
-    the first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``repeated``: some
-    frames are copies of others.
+    the first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``far`` is how many
+    pixels lie outside the window of the dark histograms in both of these, and what they have of all frames' squares.
+    ``repeated``: some frames are copies of others.
     """
 
     exposure_s: float
@@ -83,6 +84,7 @@ class Moments:
     outliers: int
     outlier_powers: tuple[float, float]
     shared: Shared
+    far: tuple[int, float] = (0, 0.0)
     repeated: bool = False
 
     @property
@@ -101,6 +103,12 @@ class Moments:
         return float(np.average(self.variance_DN2, weights=self.dof))
 
     @property
+    def near_DN2(self) -> float:
+        """Temporal variance of the pixels that are not ``far``: hot and dead pixels have noise of their own."""
+        (pixels, squares), dof = self.far, float(self.dof.sum())
+        return (self.temporal_DN2 * dof - squares) / max(dof - (self.frames - 1) * pixels, 1.0)
+
+    @property
     def outlier_variance_DN2(self) -> float:
         """What the hits would add to the temporal variance."""
         return self.outlier_powers[0] / (2 * (self.frames - 1) * self.pixels)
@@ -112,9 +120,17 @@ def stacked(levels: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels
 
 
 def reduce_frames(
-    frames: Iterable[Codes], exposure_s: float, light: float | None, period: int, rules: NoiseRules
+    frames: Iterable[Codes],
+    exposure_s: float,
+    light: float | None,
+    period: int,
+    rules: NoiseRules,
+    dark_step: int | None = None,
 ) -> tuple[Averaged, Moments]:
-    """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise."""
+    """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise.
+
+    ``dark_step`` is the converter's step, of dark frames: pixels beyond the window of the histograms are ``far``.
+    """
     source = iter(frames)
     first = next(source)
     (height, columns), (down, right) = first.shape, bins(*first.shape, period)
@@ -129,14 +145,20 @@ def reduce_frames(
     counts, total = np.outer(down.sum(axis=1), width), np.zeros(first.shape, np.float32)
     outliers, powers, squares = 0, np.zeros(2), np.zeros_like(counts)
     shared: Shared | None = None
+    far, apart = np.zeros(0, int), [np.zeros(0)]
     # Of every frame: its rows' means and its bins' sums less these, as differences from the first frame, and its peak.
     by_row, by_bin, peaks = [np.zeros(height)], [np.zeros_like(counts)], [at_peak(first)]
     for frame in source:
+        if dark_step and not shared:
+            middle_DN, reach_DN = dark_step * np.array(dark_window(first, dark_step))
+            far = np.flatnonzero(np.minimum(*(np.abs(one - middle_DN) for one in (first, frame))) > reach_DN)
+            apart = [np.zeros(far.size)]
         difference = cv2.subtract(frame, first, dtype=cv2.CV_32F)
         square = cv2.multiply(difference, difference)
         # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
         usual = np.median(square[:: max(height // 128, 1)] @ right, axis=0) / width
         hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
+        hits.ravel()[far] = False  # the shot noise of hot pixels is none
         if hits.any():
             large = square[hits].astype(np.float64)
             outliers, powers = outliers + large.size, powers + np.array([large.sum(), np.square(large).sum()])
@@ -144,6 +166,7 @@ def reduce_frames(
         by_row.append(difference.mean(axis=1, dtype=np.float64))
         difference -= by_row[-1][:, None]
         shared = shared or shared_noise(first, difference, period)
+        apart.append(difference.ravel()[far].astype(np.float64))
         total += difference
         by_bin.append(binned(difference))
         squares += binned(cv2.multiply(difference, difference))
@@ -181,6 +204,7 @@ def reduce_frames(
         outliers=outliers,
         outlier_powers=(float(powers[0]), float(powers[1])),
         shared=shared or Shared(),
+        far=(far.size, float(np.var(apart, axis=0).sum()) * number),
     )
 
 
@@ -269,7 +293,9 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     q_DN = converter_step(sample)
     metered = all(level.photons is not None for level in brights) and (stack is None or stack.photons is not None)
 
-    def moments(frames: Iterable[Frame], exposure_s: float, photons: float | None = None) -> tuple[Averaged, Moments]:
+    def moments(
+        frames: Iterable[Frame], exposure_s: float, photons: float | None = None, dark_step: int | None = None
+    ) -> tuple[Averaged, Moments]:
         marks: list[int] = []
 
         def checked() -> Iterator[Codes]:
@@ -278,22 +304,26 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
                 if mark := fingerprint(codes):
                     marks.append(mark)
 
-        mean, found = reduce_frames(checked(), exposure_s, photons if metered else None, period, rules)
+        mean, found = reduce_frames(checked(), exposure_s, photons if metered else None, period, rules, dark_step)
         return mean, replace(found, repeated=len(set(marks)) < len(marks))
 
     def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
         first, second = (loaded(frame, sample.shape) for frame in level.dark)
         _check_darker(first, level.exposure_s, flats)
-        return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level.exposure_s)[1]
+        own = moments((first, second), level.exposure_s, dark_step=q_DN)[1]
+        return dark_pair(first, second, level.exposure_s, q_DN, top), own
 
-    def average(frames: Iterable[Frame] | Averaged, stack: SpatialStack) -> tuple[Averaged, Moments | None]:
+    def average(
+        stack: SpatialStack, frames: Iterable[Frame] | Averaged, dark_step: int | None
+    ) -> tuple[Averaged, Moments | None]:
         if isinstance(frames, Averaged):
             return checked_average(frames, sample.shape), None
-        return moments(frames, stack.exposure_s, stack.photons)
+        return moments(frames, stack.exposure_s, stack.photons, dark_step)
 
     with ThreadPoolExecutor(2) as pool:
         # The stacks are the longest tasks: they go first.
-        tasks = [pool.submit(average, frames, stack) for frames in (stack.dark, stack.bright)] if stack else []
+        both = ((stack, stack.dark, q_DN), (stack, stack.bright, None)) if stack else ()
+        tasks = [pool.submit(average, *one) for one in both]
         flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
         peak = max(flat.peak_DN for flat in flats)
         possible = int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)

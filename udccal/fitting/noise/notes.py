@@ -76,8 +76,9 @@ def notes(
     size = data.flat_stack.mean_DN.size
     hot = max(1 - data.dark_samples / (len(data.darks) * size), dark.offsets.outliers / size)
     if hot > data.rules.most_hot:
-        without = "DSNU is that" if dark.skewed else "black, dark current and DSNU are those"
-        yield f"{100 * hot:.2g} % of dark samples are far from the others (hot pixels): {without} of the others."
+        without = "DSNU is that" if dark.skewed else "black, dark current, sigma_d and DSNU are those"
+        found = f"{100 * hot:.2g} % of dark samples are far from the others (hot or dead pixels)"
+        yield f"{found}: {without} of the others."
         if not dark.white:
             yield "PRNU1288 is what is left without that DSNU: offsets of hot pixels, which rounding hides, are in it."
     if len(missing := _missing_codes(data)):
