@@ -74,12 +74,6 @@ class LiveError(UdccalError):
     """A live run cannot begin or go on: its sink, its hook, or a stage of it."""
 
 
-def found_instead(value: object) -> str:
-    """What an argument is that should have been an array, for a message: type and shape."""
-    kind, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
-    return type(value).__name__ if kind is None else f"{kind} of shape {shape}"
-
-
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return a sentence for a message, after a blank, that asks for the most similar known name; empty without one."""
     nearest = difflib.get_close_matches(name, list(known), n=1)

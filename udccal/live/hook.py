@@ -14,8 +14,8 @@ from typing import final
 import numpy as np
 from jaxtyping import UInt8
 
-from udccal.errors import LiveError, found_instead
-from udccal.restoration.checks import check_number
+from udccal.arguments import check_number, found_instead
+from udccal.errors import LiveError
 
 Picture = UInt8[np.ndarray, "rows columns 3"]
 # What a hook returns is checked.

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import final
 
+from udccal.arguments import check_count, check_number
 from udccal.cameras.protocol import Frame
 from udccal.errors import LiveError, UdccalError
 from udccal.live.hook import Picture, TimedHook
 from udccal.live.newest import Newest
 from udccal.live.sinks.protocol import RestoredFrame, Sink
 from udccal.live.tally import Figures, Stage, Tally
-from udccal.restoration.checks import check_count, check_number
 
 _SHOW_EVERY_S = 1.0
 # The longest that a camera waits for a frame is its time-out of 2 s and an exposure.

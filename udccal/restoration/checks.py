@@ -1,4 +1,4 @@
-"""What restoration accepts from outside: frames, exposures, panel pictures and plain numbers."""
+"""What restoration accepts from outside: frames, exposures, panel pictures and raw files."""
 
 from __future__ import annotations
 
@@ -6,50 +6,14 @@ from typing import Final
 
 import numpy as np
 
-from udccal.errors import RestorationError, UdccalError, found_instead
+from udccal.arguments import check_number, found_instead
+from udccal.errors import RestorationError, UdccalError
 from udccal.profiles.profile import Profile
 from udccal.restoration.linear import scalar
 from udccal.rig import RigDescription
 
 # From a nanosecond to a day.
 EXPOSURES_S: Final = (1e-9, 86400.0)
-_WHOLE = int | np.integer
-_NUMBER = _WHOLE | float | np.floating
-
-
-def check_number(
-    value: object,
-    what: str,
-    bounds: tuple[float, float],
-    advice: str,
-    error: type[UdccalError] = RestorationError,
-) -> None:
-    """Refuse what is no number within bounds, both included; NaN and truth values are none.
-
-    Args:
-        value: what was given.
-        what: its name and unit, for the message.
-        bounds: least and largest value.
-        advice: what to do, a sentence.
-        error: kind of the error.
-
-    Raises:
-        UdccalError: of that kind, with the bounds.
-    """
-    if isinstance(value, bool) or not isinstance(value, _NUMBER) or not bounds[0] <= value <= bounds[1]:
-        raise error(f"Expected {what} from {bounds[0]:g} to {bounds[1]:g}, found {_shown(value)}. {advice}")
-
-
-def check_count(value: object, what: str, least: int, most: int, error: type[UdccalError] = RestorationError) -> None:
-    """Refuse what is no whole number within bounds, both included.
-
-    Raises:
-        UdccalError: of the kind ``error``, with the bounds.
-    """
-    if isinstance(value, bool) or not isinstance(value, _WHOLE) or not least <= value <= most:
-        raise error(
-            f"Expected {what} as a whole number from {least} to {most}, found {_shown(value)}. Give one of these."
-        )
 
 
 def real_array(value: object, what: str) -> np.ndarray:
@@ -153,7 +117,3 @@ def check_raw_file(cfa: str, bits: int, black_DN: float, profile: Profile) -> No
                 f"Expected a raw file with the {what} {expected} of rig '{profile.rig.name}', found {found}. Use the "
                 "profile of the camera that took it, and the camera's own samples, neither turned nor cut."
             )
-
-
-def _shown(value: object) -> str:
-    return repr(value)[:40] if isinstance(value, str | _NUMBER) else found_instead(value)

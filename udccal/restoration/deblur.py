@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.optimize import nnls
 
+from udccal.arguments import check_count
 from udccal.errors import RestorationError
 from udccal.restoration.blur import blurred
-from udccal.restoration.checks import check_count, real_array
+from udccal.restoration.checks import real_array
 from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import filtered_and_joined
@@ -72,8 +73,8 @@ def deblur(
     tier = tier_named(tier)
     if tier is Tier.preview:
         raise RestorationError("Expected a tier that deblurs, found preview. Give fast, balanced or accurate.")
-    check_count(tile_px, "tile_px", 1, 16384)
-    check_count(workers, "workers", 1, 256)
+    check_count(tile_px, "tile_px", 1, 16384, RestorationError)
+    check_count(workers, "workers", 1, 256, RestorationError)
     given_arrays = {"picture": picture, "kernels": kernels, "x_px": x_px, "y_px": y_px}
     picture, *places = (real_array(each, what) for what, each in given_arrays.items())
     grid = _checked(picture, *places)

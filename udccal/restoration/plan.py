@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
+from udccal.arguments import check_count
 from udccal.errors import RestorationError
 from udccal.kernels import KERNEL_COLUMNS, KERNEL_ROWS, fitted_size, kernels_at
 from udccal.models.psf import PsfField
-from udccal.restoration.checks import check_count
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.rectify import Interpolation
 from udccal.restoration.tiles import LEAST_PX
@@ -61,7 +61,7 @@ class PlanOptions:
 
     def __post_init__(self) -> None:
         for name, (least, most) in _BOUNDS.items():
-            check_count(getattr(self, name), f"PlanOptions.{name}", least, most)
+            check_count(getattr(self, name), f"PlanOptions.{name}", least, most, RestorationError)
         if not isinstance(self.interpolation, Interpolation):
             raise RestorationError(
                 f"Expected PlanOptions.interpolation of {', '.join(map(str, Interpolation))}, found "

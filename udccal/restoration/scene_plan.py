@@ -11,9 +11,9 @@ from typing import Annotated, ClassVar, Final, Literal, final
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from udccal.arguments import check_number
 from udccal.errors import RestorationError
 from udccal.profiles.profile import Profile
-from udccal.restoration.checks import check_number
 from udccal.restoration.prepared import checksum
 from udccal.restoration.stages import Stage, StageChoice
 from udccal.tiers import DEFAULT_TIER, Tier
@@ -58,9 +58,13 @@ class Wish:
 
     def __post_init__(self) -> None:
         if self.budget_ms is not None:
-            check_number(self.budget_ms, "a budget in ms", (0.0, 86400e3), "Leave it out to allow any time.")
+            check_number(
+                self.budget_ms, "a budget in ms", (0.0, 86400e3), "Leave it out to allow any time.", RestorationError
+            )
         if self.min_psnr_dB is not None:
-            check_number(self.min_psnr_dB, "a least PSNR in dB", (0.0, 200.0), "Leave it out to accept any.")
+            check_number(
+                self.min_psnr_dB, "a least PSNR in dB", (0.0, 200.0), "Leave it out to accept any.", RestorationError
+            )
 
 
 @final

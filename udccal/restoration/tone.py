@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt16
 
+from udccal.arguments import check_number
 from udccal.errors import RestorationError
-from udccal.restoration.checks import check_number
 
 _PERCENTILE, _LEVEL = 97.0, 0.9
 
@@ -30,13 +30,21 @@ class Tone:
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        check_number(self.exposure, "an exposure of the display", (0.0, 1e30), "Try display_exposure of a picture.")
+        check_number(
+            self.exposure,
+            "an exposure of the display",
+            (0.0, 1e30),
+            "Try display_exposure of a picture.",
+            RestorationError,
+        )
         if not isinstance(self.gains, tuple) or len(self.gains) != 3:
             raise RestorationError(
                 f"Expected a tuple of three gains, of red, green and blue, found {self.gains!r:.80}. Give three."
             )
         for gain in self.gains:
-            check_number(gain, "a gain of a colour", (0.0, 1e6), "A gain of 1 leaves the colour as it is.")
+            check_number(
+                gain, "a gain of a colour", (0.0, 1e6), "A gain of 1 leaves the colour as it is.", RestorationError
+            )
 
     def scale(self) -> Float32[np.ndarray, "3"]:
         """Return the factor of each colour from linear light to the display's range."""

@@ -246,7 +246,7 @@ def test_an_exposure_that_is_a_frame_is_refused() -> None:
     level = ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))
     # What runs with types checked refuses it earlier.
     object.__setattr__(level, "exposure_s", FRAME)
-    with pytest.raises(FitError, match=r"level 0 to have an exposure in seconds, found uint16 of shape \(32, 32\)"):
+    with pytest.raises(FitError, match=r"level 0 to have an exposure in seconds .* found uint16 of shape \(32, 32\)"):
         fit_noise(NoiseData([level]))
 
 
@@ -257,7 +257,7 @@ def test_an_exposure_that_is_a_frame_is_refused() -> None:
         ({"levels": (level for level in [])}, "sequence of exposure levels, found generator"),
         ({"levels": ExposureLevel(0.1)}, "sequence of exposure levels, found ExposureLevel"),
         ({"levels": [FRAME]}, "every level as an ExposureLevel, found uint16"),
-        ({"top_code": "4095"}, "top_code as a whole number of 1 to 65535, found '4095'"),
+        ({"top_code": "4095"}, "top_code as a whole number from 1 to 65535, found '4095'"),
         ({"top_code": float("nan")}, "found nan"),
         ({"top_code": 1e9}, "found 1000000000.0"),
         ({"top_code": True}, "found True"),
@@ -275,8 +275,8 @@ def test_data_of_another_kind_are_refused(changed: dict[str, Any], sentence: str
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("exposure_s", True, "level 0 to have an exposure in seconds, found bool"),
-        ("photons", True, "level 0 to have a number of photons, found bool"),
+        ("exposure_s", True, "level 0 to have an exposure in seconds .* found True"),
+        ("photons", True, "level 0 to have a number of photons .* found True"),
         ("dark", None, "dark frames of level 0 as a sequence, found NoneType"),
         ("bright", (frame for frame in [FRAME]), "bright frames of level 0 as a sequence, found generator"),
     ],

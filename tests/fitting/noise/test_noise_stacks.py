@@ -105,7 +105,7 @@ def test_frames_of_one_code_may_agree() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"frames": 0}, "1 or more frames in the stack, found 0"),
+        ({"frames": 0}, "the frames of an average in the stack .* found 0"),
         ({"frames": -1}, "found -1"),
         ({"frames": float("nan")}, "found nan"),
         ({"frames": None}, "found NoneType"),
@@ -114,7 +114,7 @@ def test_frames_of_one_code_may_agree() -> None:
         ({"mean_DN": [[0.0]]}, "found list"),
         ({"mean_DN": None}, "found NoneType"),
         ({"mean_DN": np.full((144, 192), np.nan, np.float32)}, "27648 samples that are no number"),
-        ({"exposure_s": -3.0}, "an average of the stack to have an exposure in seconds, found -3"),
+        ({"exposure_s": -3.0}, "an average of the stack to have an exposure in seconds .* found -3"),
     ],
 )
 def test_an_average_of_no_frames_is_refused(change: dict[str, Any], words: str) -> None:

@@ -11,6 +11,7 @@ from typing import Final, Literal, final
 import numpy as np
 from jaxtyping import UInt8
 
+from udccal.arguments import check_number
 from udccal.benches.bench import simulated_rig
 from udccal.benches.photograph import capture_photograph
 from udccal.cameras.checks import check_settings
@@ -24,7 +25,7 @@ from udccal.cli.jobs.demonstration import portrait
 from udccal.errors import CameraError
 from udccal.live.pacing import looped, paced, streamed
 from udccal.models.geometry import VirtualView
-from udccal.restoration.checks import check_exposure, check_number
+from udccal.restoration.checks import check_exposure
 from udccal.rig import RigDescription
 from udccal.sessions.schema import StoredCamera
 from udccal.simulation.world import SimulatedWorld

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from udccal.errors import FitError, found_instead
+from udccal.arguments import check_array, found_instead
+from udccal.errors import FitError
 from udccal.rig import RigDescription
 
 if TYPE_CHECKING:
     from udccal.fitting.backscatter.data import BackscatterData, Binned
 
-_KINDS: Final = {"fiu": "real numbers", "b": "truth values", "u": "8-bit values"}
-
-
-def _expect_array(name: str, array: Any, kind: str, shape: tuple[int, ...]) -> None:
-    fits = isinstance(array, np.ndarray) and array.dtype.kind in kind and array.shape == shape
-    if not fits or (kind == "u" and array.itemsize > 1):
-        expected = f"Expected {name} as an array of {_KINDS[kind]} of shape {shape}"
-        raise FitError(f"{expected}, found {found_instead(array)}. Give each shot its own.")
+_EACH: Final = "Give each shot its own."
 
 
 def check_shapes(shots: Binned) -> None:
@@ -29,10 +23,10 @@ def check_shapes(shots: Binned) -> None:
         found = found_instead(shots.rate)
         raise FitError(f"Expected rates as an array, shots x 3 colours x bins, found {found}. Bin the shots' averages.")
     for name in ("rate", "shot", "rest"):
-        _expect_array(name, getattr(shots, name), "fiu", shape)
-    _expect_array("clipped", shots.clipped, "b", shape)
+        check_array(getattr(shots, name), name, "real numbers", shape, _EACH, FitError)
+    check_array(shots.clipped, "clipped", "truth values", shape, _EACH, FitError)
     for name in ("exposure_s", "scatter"):
-        _expect_array(name, getattr(shots, name), "fiu", shape[:1])
+        check_array(getattr(shots, name), name, "real numbers", shape[:1], _EACH, FitError)
 
 
 def check_data(data: BackscatterData) -> None:
@@ -47,7 +41,8 @@ def check_data(data: BackscatterData) -> None:
         raise FitError(
             f"{expected}, found {len(data.names)}. Give white first, dark last, and the names of the others."
         )
-    _expect_array("the pictures shown", data.shown, "u", (pictures, crop.rows, crop.columns, 3))
+    shape = pictures, crop.rows, crop.columns, 3
+    check_array(data.shown, "the pictures shown", "8-bit values", shape, _EACH, FitError)
     if not (np.isfinite(shots.exposure_s) & (shots.exposure_s > 0)).all():
         found = shots.exposure_s[:8].tolist()
         raise FitError(f"Expected positive exposures, found {found}. Give the exposure of each shot in seconds.")

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
+from udccal.arguments import found_instead
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.hdr.likelihood import BlockMerge, HdrRules, SensorNumbers, compiled_merge_block, merge_block
@@ -113,8 +114,8 @@ def merge_bracket(
 def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposures"]:
     """The exposures, where frames and exposures are what they should be."""
     if not isinstance(frames, np.ndarray) or frames.dtype.kind not in "ui" or frames.ndim < 2:
-        found = f"{frames.dtype} of shape {frames.shape}" if isinstance(frames, np.ndarray) else type(frames).__name__
-        raise FitError(f"Expected frames as an array of whole codes, frame by frame, found {found}. Pass raw codes.")
+        expected = "Expected frames as an array of whole codes, frame by frame"
+        raise FitError(f"{expected}, found {found_instead(frames)}. Pass raw codes.")
     try:
         times = np.asarray(exposures_s, dtype=np.float64)
     except (TypeError, ValueError):

@@ -13,7 +13,8 @@ from typing import final
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from udccal.errors import FitError, found_instead
+from udccal.arguments import check_count, check_number, found_instead
+from udccal.errors import FitError
 from udccal.sessions.store import Session
 
 Codes = UInt16[np.ndarray, "rows columns"]
@@ -141,10 +142,7 @@ class NoiseData:
         for where, one in exposed:
             photons = 0.0 if isinstance(one, Averaged) or one.photons is None else one.photons
             for name, value in (("an exposure in seconds", one.exposure_s), ("a number of photons", photons)):
-                if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-                    raise FitError(f"Expected {where} to have {name}, found {found_instead(value)}. Give one number.")
-                if not (np.isfinite(value) and value >= 0):
-                    raise FitError(f"Expected {where} to have {name}, found {value}. Give a number of 0 or more.")
+                check_number(value, f"{where} to have {name}", (0.0, 1e12), "Give a number of 0 or more.", FitError)
         for index, level in enumerate(self.levels):
             for name, pair in (("dark", level.dark), ("bright", level.bright)):
                 if len(pair) not in (0, 2):
@@ -166,11 +164,8 @@ class NoiseData:
         stack = () if self.stack is None else (self.stack.dark, self.stack.bright)
         if wrong := [type(one).__name__ for one in stack if not isinstance(one, Sequence | np.ndarray | Averaged)]:
             raise FitError(f"Expected the stack's frames as a sequence or an average, found {wrong[0]}. Leave it out.")
-        top = self.top_code
-        whole = isinstance(top, int | np.integer) and not isinstance(top, bool)
-        if top is not None and not (whole and 1 <= top <= _LARGEST_CODE):
-            found = f"{top!r}. Leave it out where it is not known"
-            raise FitError(f"Expected top_code as a whole number of 1 to {_LARGEST_CODE}, found {found}.")
+        if self.top_code is not None:
+            check_count(self.top_code, "top_code", 1, _LARGEST_CODE, FitError)
 
 
 def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
@@ -178,8 +173,8 @@ def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
     array = frame() if callable(frame) else frame
     kind = array.dtype.newbyteorder("=") if isinstance(array, np.ndarray) else None
     if kind not in (np.uint8, np.uint16) or array.ndim != 2:
-        found = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-        raise FitError(f"Expected a frame as uint8 or uint16 array of rows x columns, found {found}. Pass raw codes.")
+        expected = "Expected a frame as uint8 or uint16 array of rows x columns"
+        raise FitError(f"{expected}, found {found_instead(array)}. Pass raw codes.")
     if min(array.shape) < _LEAST_SIDE or max(array.shape) > _MOST_SIDE:
         raise FitError(f"Expected frames of {_LEAST_SIDE} to {_MOST_SIDE} samples a side, found {array.shape}.")
     if shape is not None and array.shape != shape:
@@ -198,9 +193,7 @@ def checked_average(average: Averaged, shape: tuple[int, ...]) -> Averaged:
         raise FitError(
             f"Expected codes in an average of the stack, found {bad} samples that are no number. Leave it out."
         )
-    if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or frames < 1:
-        found = str(frames) if isinstance(frames, int | float | np.number) else found_instead(frames)
-        raise FitError(f"Expected an average of 1 or more frames in the stack, found {found}. Give their number.")
+    check_count(frames, "the frames of an average in the stack", 1, 2**31, FitError)
     return average
 
 

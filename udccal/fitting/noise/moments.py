@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from udccal.errors import FitError, found_instead
+from udccal.arguments import found_instead
+from udccal.errors import FitError
 from udccal.fitting.noise.codes import DarkPair, dark_pair, dark_window
 from udccal.fitting.noise.data import (
     Averaged,

@@ -15,23 +15,24 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
-from udccal.errors import FitError, found_instead
+from udccal.arguments import Numbers, check_array, found_instead
+from udccal.errors import FitError
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.engine.robust import Huber
 from udccal.result import FitStatus
 
 HUBER: Final = Huber()
 Crops = Float[np.ndarray, "shots rows columns"]
-# Kinds of numbers, and the shape for each shot; None is that of the rates.
-_ARRAYS: Final[dict[str, tuple[str, tuple[int, ...] | None]]] = {
-    "centre_px": ("fiu", (2,)),
-    "origin_px": ("iu", (2,)),
-    "position": ("iu", ()),
-    "disc_px": ("fiu", ()),
-    "rate": ("fiu", None),
-    "weight": ("fiu", None),
-    "channel": ("iu", None),
-    "noise_per_rate": ("fiu", None),
+# Numbers, and the shape for each shot; None is that of the rates.
+_ARRAYS: Final[dict[str, tuple[Numbers, tuple[int, ...] | None]]] = {
+    "centre_px": ("real numbers", (2,)),
+    "origin_px": ("whole numbers", (2,)),
+    "position": ("whole numbers", ()),
+    "disc_px": ("real numbers", ()),
+    "rate": ("real numbers", None),
+    "weight": ("real numbers", None),
+    "channel": ("whole numbers", None),
+    "noise_per_rate": ("real numbers", None),
 }
 
 
@@ -154,9 +155,7 @@ class Shots:
             )
         for name, (kinds, shape) in _ARRAYS.items():
             array, expected = getattr(self, name), crops if shape is None else (crops[0], *shape)
-            if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds or array.shape != expected:
-                numbers = f"{name} as an array of {'real' if 'f' in kinds else 'whole'} numbers of shape {expected}"
-                raise FitError(f"Expected {numbers}, found {found_instead(array)}. Give each shot its own.")
+            check_array(array, name, kinds, expected, "Give each shot its own.", FitError)
         positions = np.unique(self.position)
         if not np.array_equal(positions, np.arange(len(positions))):
             raise FitError(f"Expected positions without gaps, found {positions[:8].tolist()}. Number them from 0.")

@@ -9,8 +9,9 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from udccal.arguments import check_array, check_number
 from udccal.cfa import cfa_named
-from udccal.errors import FitError, found_instead
+from udccal.errors import FitError
 from udccal.fitting.engine.robust import robust_sigma
 from udccal.result import FitStatus
 
@@ -37,33 +38,38 @@ class Stamps:
     channel: Int[np.ndarray, "*channels"] | None = None
 
     def __post_init__(self) -> None:
-        for name, array, axes in (("stamps", self.values_e, 3), ("positions", self.position_px, 2)):
-            if not isinstance(array, np.ndarray) or array.ndim != axes or array.dtype.kind not in "fiu":
-                shape = "stars x rows x columns" if axes == 3 else "stars x 2"
-                expected = f"Expected {name} as an array of real numbers, {shape}"
-                raise FitError(f"{expected}, found {found_instead(array)}. Cut one stamp about each star.")
+        axes, advice = ("stars", "rows", "columns"), "Cut one stamp about each star."
+        check_array(self.values_e, "stamps", "real numbers", axes, advice, FitError)
         count, *sides = self.values_e.shape
         if min(sides) < 7 or max(sides) > 255:
             raise FitError(f"Expected stamps of 7 to 255 samples a side, found {sides[0]} x {sides[1]}. Cut them anew.")
         if self.values_e.size > 2**26:
             raise FitError(f"Expected at most {2**26} samples, found {self.values_e.size}. Use fewer stamps.")
-        if len(self.position_px) != count:
-            raise FitError(f"Expected a position for each of {count} stamps, found {len(self.position_px)}.")
-        if self.position_px.shape[1] != 2 or not (np.abs(self.position_px) <= _FARTHEST_PX).all():
-            span = f"{self.position_px.shape[1]} columns from {self.position_px.min():g} to {self.position_px.max():g}"
-            expected = f"Expected positions (x, y) on the sensor, of at most {_FARTHEST_PX} px"
-            raise FitError(f"{expected}, found {span}. Give each stamp's middle sample.")
-        if not (np.isfinite(self.read_e) and self.read_e > 0):
-            raise FitError(f"Expected a read noise above 0 e-, found {self.read_e}. Count the quantisation into it.")
-        if not self.clip_e > 0:
-            raise FitError(f"Expected a clipping level above 0 e-, found {self.clip_e}. Leave it out if nothing clips.")
+        advice = "Give each stamp's middle sample."
+        check_array(self.position_px, "positions", "real numbers", (count, 2), advice, FitError)
+        if not (np.abs(self.position_px) <= _FARTHEST_PX).all():
+            span = f"{self.position_px.min():g} to {self.position_px.max():g}"
+            raise FitError(f"Expected positions on the sensor of at most {_FARTHEST_PX} px, found {span}. {advice}")
+        bounds, advice = (1e-6, 1e9), "Count the quantisation into it."
+        check_number(self.read_e, "a read noise in e-", bounds, advice, FitError)
+        advice = "Leave it out if nothing clips."
+        check_number(self.clip_e, "a clipping level in e-", (1e-6, np.inf), advice, FitError)
+        self._check_different()
         if self.channel is None:
             return
-        if self.channel.shape != self.values_e.shape:
-            raise FitError(f"Expected a channel for every sample, {self.values_e.shape}, found {self.channel.shape}.")
+        advice = "Name the colour of every sample."
+        check_array(self.channel, "channels", "whole numbers", self.values_e.shape, advice, FitError)
         found = np.unique(self.channel)
         if not np.array_equal(found, np.arange(len(found))) or len(found) > 3:
             raise FitError(f"Expected channels 0, 1 and 2 without gaps, found {found.tolist()}. Number them from 0.")
+
+    def _check_different(self) -> None:
+        """A FitError where all stamps have one place, or some are copies: noise is never the same twice."""
+        if len(self.position_px) > 1 and not np.ptp(self.position_px, axis=0).any():
+            raise FitError("Expected stamps from several places, found one. Give each stamp's own middle sample.")
+        marks = [hash(one.tobytes()) for one in self.values_e if np.isfinite(one).any() and np.ptp(one) != 0]
+        if copies := len(marks) - len(set(marks)):
+            raise FitError(f"Expected a stamp of each star, found {copies} that are copies of others. Leave them out.")
 
     @cached_property
     def known(self) -> Bool[np.ndarray, "stars samples"]:

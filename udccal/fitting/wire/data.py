@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
 
+from udccal.arguments import check_array, check_number
 from udccal.cfa import PATTERNS, cfa_named
-from udccal.errors import FitError, found_instead
+from udccal.errors import FitError
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry
@@ -65,17 +66,15 @@ class WireData:
 
     def __post_init__(self) -> None:
         for name, array in (("signal", self.signal), ("variance", self.variance)):
-            if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiu":
-                expected = f"Expected the {name} as an array of real numbers, rows x columns"
-                raise FitError(f"{expected}, found {found_instead(array)}. Pass the average of one mosaic.")
+            advice = "Pass the average of one mosaic."
+            check_array(array, f"the {name}", "real numbers", ("rows", "columns"), advice, FitError)
         if self.signal.shape != self.variance.shape:
             found = f"{self.signal.shape} and {self.variance.shape}"
             raise FitError(f"Expected signal and variance of one shape, found {found}. Give each pixel its variance.")
         if self.variance.size and not (np.isfinite(self.variance) & (self.variance >= 0)).any():
             raise FitError("Expected variances of 0 or more, found none. Take them from the frames that were averaged.")
         for name, number in (("PRNU1288", self.PRNU1288), ("part of clipped pixels", self.clipped)):
-            if not (np.ndim(number) == 0 and 0 <= number <= 1):
-                raise FitError(f"Expected a {name} from 0 to 1, found {number}. Take it from the noise fit.")
+            check_number(number, f"a {name}", (0.0, 1.0), "Take it from the noise fit.", FitError)
         if np.isnan(self.clip):
             raise FitError("Expected a signal from which frames clip, found NaN. Leave it out if nothing clips.")
         if self.cfa not in PATTERNS:

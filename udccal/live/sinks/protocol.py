@@ -8,9 +8,9 @@ from typing import Protocol, final, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
+from udccal.arguments import check_number
 from udccal.errors import LiveError
 from udccal.plugins import find_sink
-from udccal.restoration.checks import check_number
 
 
 @final

@@ -1,0 +1,83 @@
+"""Checks of what a caller gives: numbers, counts and arrays. Each refusal is one sentence, and what to do."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import numpy as np
+
+from udccal.errors import UdccalError
+
+Numbers = Literal["real numbers", "whole numbers", "truth values", "8-bit values"]
+_KINDS: Final[dict[Numbers, str]] = {
+    "real numbers": "fiu",
+    "whole numbers": "iu",
+    "truth values": "b",
+    "8-bit values": "u",
+}
+_WHOLE = int | np.integer
+_NUMBER = _WHOLE | float | np.floating
+
+
+def found_instead(value: object) -> str:
+    """What an argument is that should have been an array, for a message: type and shape."""
+    kind, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    return type(value).__name__ if kind is None else f"{kind} of shape {shape}"
+
+
+def check_number(value: object, what: str, bounds: tuple[float, float], advice: str, error: type[UdccalError]) -> None:
+    """Refuse what is no number within bounds, both included; NaN and truth values are none.
+
+    Args:
+        value: what was given.
+        what: its name and unit, for the message.
+        bounds: least and largest value.
+        advice: what to do, a sentence.
+        error: kind of the error.
+
+    Raises:
+        UdccalError: of that kind, with the bounds.
+    """
+    if isinstance(value, bool) or not isinstance(value, _NUMBER) or not bounds[0] <= value <= bounds[1]:
+        raise error(f"Expected {what} from {bounds[0]:g} to {bounds[1]:g}, found {_shown(value)}. {advice}")
+
+
+def check_count(value: object, what: str, least: int, most: int, error: type[UdccalError]) -> None:
+    """Refuse what is no whole number within bounds, both included.
+
+    Raises:
+        UdccalError: of the kind ``error``, with the bounds.
+    """
+    if isinstance(value, bool) or not isinstance(value, _WHOLE) or not least <= value <= most:
+        raise error(
+            f"Expected {what} as a whole number from {least} to {most}, found {_shown(value)}. Give one of these."
+        )
+
+
+def check_array(
+    value: object, what: str, numbers: Numbers, shape: tuple[int | str, ...], advice: str, error: type[UdccalError]
+) -> None:
+    """Refuse what is no array of such numbers and such a shape.
+
+    Args:
+        value: what was given.
+        what: its name, for the message.
+        numbers: that it holds.
+        shape: length of each axis, or the name of one of any length.
+        advice: what to do, a sentence.
+        error: kind of the error.
+
+    Raises:
+        UdccalError: of that kind, with kind and shape of the array.
+    """
+    fits = isinstance(value, np.ndarray) and value.dtype.kind in _KINDS[numbers] and value.ndim == len(shape)
+    if isinstance(value, np.ndarray) and fits:
+        fits = all(isinstance(n, str) or n == found for n, found in zip(shape, value.shape, strict=True))
+        fits = fits and (numbers != "8-bit values" or value.itemsize == 1)
+    if not fits:
+        expected = f"Expected {what} as an array of {numbers}, {' x '.join(map(str, shape))}"
+        raise error(f"{expected}, found {found_instead(value)}. {advice}")
+
+
+def _shown(value: object) -> str:
+    return repr(value)[:40] if isinstance(value, str | _NUMBER) else found_instead(value)
