@@ -11,7 +11,7 @@ from udccal.errors import FitError
 
 @pytest.mark.parametrize("value", [True, None, "3", np.nan, -0.1, 1.1, np.zeros(1)])
 def test_what_is_no_number_within_bounds_is_refused(value: object) -> None:
-    with pytest.raises(FitError, match="Expected a part from 0 to 1, found .* Give one"):
+    with pytest.raises(FitError, match=r"Expected a part from 0 to 1, found .* Give one"):
         check_number(value, "a part", (0.0, 1.0), "Give one.", FitError)
 
 
