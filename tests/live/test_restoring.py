@@ -25,8 +25,8 @@ from udccal.live.pipeline import Limits, Pipeline
 from udccal.live.restoring import Restoring
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import write_profile
-from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.device.restorer import DeviceRestorer
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone, display_exposure
 from udccal.rig import RigDescription, load_rig

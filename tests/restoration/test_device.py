@@ -17,10 +17,11 @@ from udccal.errors import RestorationError
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.noise import Noise
 from udccal.restoration import dark_places
-from udccal.restoration.backscatter import PanelLight, PanelMask, PanelSums
+from udccal.restoration.backscatter import PanelLight, PanelSums
 from udccal.restoration.device.light import plausible as dark_on_device
 from udccal.restoration.device.restorer import DeviceRestorer
 from udccal.restoration.kernel_grid import KernelGrid
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.shrink import linear_weights
 from udccal.restoration.tone import Tone
@@ -116,6 +117,18 @@ def test_a_device_shows_what_the_cpu_shows(
 ) -> None:
     for shown in (picture, np.zeros_like(picture), None):
         assert agree(off(restorers[tier], devices[tier], frame, shown), 2 if tier is Tier.accurate else 1)
+
+
+def test_of_an_unknown_panel_something_is_put_back(restorers: dict[Tier, Restorer], frame: np.ndarray) -> None:
+    """So that the comparison of devices sees it."""
+    restorer = restorers[Tier.fast]
+    light, sharpener = restorer.scene_light(frame, EXPOSURE_S), restorer.sharpener
+    assert light.levels is not None
+    assert restorer.mask is not None
+    assert sharpener is not None
+    sharp = sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
+    back = restorer.mask.put_back(sharp, light.levels, sharpener.layout.inner.start, EXPOSURE_S, restorer.noise)
+    assert np.abs(back - sharp).max() > 3.0 / TONE.exposure * EXPOSURE_S / 255
 
 
 @pytest.mark.medium

@@ -11,9 +11,9 @@ from tests.scenes.toy_restorer import made
 from udccal.cfa import cfa_named
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
-from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.deblur import deblur
 from udccal.restoration.kernel_grid import KernelGrid
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.tone import Tone
 from udccal.rig import RigDescription
 from udccal.tiers import Tier

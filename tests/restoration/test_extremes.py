@@ -13,11 +13,11 @@ from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
-from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.checks import check_frame
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.metrics import display_exposure, encode_srgb, psnr
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone
 from udccal.rig import RigDescription

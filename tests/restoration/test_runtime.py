@@ -12,11 +12,11 @@ from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
-from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.metrics import display_exposure, encode_srgb, least_squares_gain, psnr
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.runtime import Restorer

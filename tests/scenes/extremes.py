@@ -15,9 +15,9 @@ from jaxtyping import Float32, UInt16
 from tests.scenes import toy_restorer
 from tests.scenes.toy_restorer import COLUMNS, EXPOSURE_S, NOISE, ROWS, made, recorded_e, taken
 from udccal.cfa import cfa_named
-from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.deblur import deblur
 from udccal.restoration.kernel_grid import KernelGrid
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.runtime import Restorer
 from udccal.rig import RigDescription
 from udccal.tiers import Tier

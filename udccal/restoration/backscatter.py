@@ -1,4 +1,4 @@
-"""Backscatter to subtract: from the panel picture when it is known, from the mask alone when it is not."""
+"""Backscatter of a panel whose picture is known, to subtract."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 from scipy import sparse
@@ -15,21 +14,12 @@ from scipy import sparse
 from udccal.cfa import Cfa, cfa_named
 from udccal.errors import PanelPictureError, RestorationError
 from udccal.models.backscatter import Backscatter, cubic_weights, panel_light, panel_response
-from udccal.models.noise import Noise
 from udccal.numerics import in_float64
-from udccal.restoration.linear import variance_floor_e2
 from udccal.restoration.prepared import kept
 from udccal.rig import RigDescription
 
 # Shares below this fraction of all light are left out.
 _LEAST_SHARE = 1e-6
-# Side in samples of the blocks that give the level: large enough to average noise, small enough to find dark places.
-BLOCK = 8
-# Light of a block that noise hardly exceeds: so many sigma above its mean. Of that, the darkest places give the level.
-SIGMAS = 3.5
-PERCENTILE = 0.1
-# Strips across the frame: the darkest one gives the level, so that a dark strip is found beside bright ones.
-STRIPS = 12
 # A frame is darker than its panel's light where this is more than so many times the frame, and more than so few e-.
 _MORE, _NEGLIGIBLE_E = 1.2, 1.0
 # Samples of which the sums are taken: few, and by an odd step, so that every colour is among them.
@@ -219,81 +209,3 @@ def refuse_excess_of(seen: float, expected: float, samples: float) -> None:
             f"where the panel picture alone gives {expected / samples:.3g} e- at this exposure. Check that the "
             "exposure is in seconds (8 ms are 0.008), and that the panel showed that picture; or leave the picture out."
         )
-
-
-def mask_mosaic(
-    mask: Float32[np.ndarray, "half_rows half_columns 3"], cfa: Cfa, rows: int, columns: int
-) -> Float32[np.ndarray, "rows columns"]:
-    """Return the profile's mask, one value per cell and channel, at every sample of the mosaic in its own colour."""
-    last_row, last_column = mask.shape[0] - 1, mask.shape[1] - 1
-    cell_rows = np.minimum(np.arange(rows) // cfa.rows, last_row)[:, None]
-    cell_columns = np.minimum(np.arange(columns) // cfa.columns, last_column)[None, :]
-    return mask[cell_rows, cell_columns, cfa.channel_map(rows, columns)]
-
-
-@final
-@dataclass(frozen=True)
-class PanelMask:
-    """Backscatter of a panel whose picture is not known: that of a white one times a level per colour.
-
-    Attributes:
-        white: backscatter of a white panel in e-/s.
-        cfa: the camera's colour pattern.
-        error: sigma of the light over the light, as the calibration states it; 0 when it does not.
-    """
-
-    white: Float32[np.ndarray, "rows columns"]
-    cfa: Cfa
-    error: float = 0.0
-
-    @functools.cached_property
-    def _possible(self) -> list[Float32[np.ndarray, "down across"]]:
-        return _block_means(self.white, self.cfa)
-
-    def levels(
-        self, signal_e: Float32[np.ndarray, "rows columns"], exposure_s: float, noise: Noise
-    ) -> Float32[np.ndarray, "3"]:
-        """Estimate each colour's level, from 0 to 1; 0 for a colour without samples.
-
-        Light only adds, so a frame is nowhere darker than its backscatter. In each of 12 strips across the frame, the
-        0.1st percentile of frame over white panel is taken in blocks of 8 x 8 samples; the level is the lowest strip's.
-        Each block is taken 3.5 sigma of its noise brighter than it is: of some thousand blocks, the darkest are dark by
-        noise. In a scene without dark places the level is too high, by at most the scene's own darkest places.
-
-        Args:
-            signal_e: signal in e-, divided by the wire.
-            exposure_s: exposure time of the frame.
-            noise: the noise term.
-        """
-        light, floor_e2 = _block_means(signal_e, self.cfa), variance_floor_e2(noise, exposure_s)
-        levels = np.zeros(3, dtype=np.float32)
-        for channel in {site.channel for site in self.cfa.sites}:
-            same = [index for index, site in enumerate(self.cfa.sites) if site.channel == channel]
-            seen, possible = (np.mean([planes[index] for index in same], axis=0) for planes in (light, self._possible))
-            samples = len(same) * min(BLOCK**2, signal_e.size) / len(self.cfa.sites)
-            seen += SIGMAS * np.sqrt((np.maximum(seen, 0) + np.float32(floor_e2)) / np.float32(samples))
-            usable = possible > 0
-            if usable.any():
-                ratio = seen[usable] / possible[usable]
-                strips = np.array_split(ratio, min(STRIPS, ratio.size))
-                lowest = min(np.percentile(strip, PERCENTILE) for strip in strips)
-                levels[channel] = np.clip(lowest / exposure_s, 0.0, 1.0)
-        return levels
-
-    def rate(self, levels: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "rows columns"]:
-        """Return the backscatter in e-/s at these levels."""
-        rate = np.empty_like(self.white)
-        for site in self.cfa.sites:
-            rate[site.samples] = levels[site.channel] * self.white[site.samples]
-        return rate
-
-
-def _block_means(mosaic: Float32[np.ndarray, "rows columns"], cfa: Cfa) -> list[Float32[np.ndarray, "down across"]]:
-    """Return each site's mean in blocks."""
-    down, across = (max(size // BLOCK, 1) for size in mosaic.shape)
-    columns = (across * BLOCK if mosaic.shape[1] >= BLOCK else mosaic.shape[1]) // cfa.columns * cfa.columns
-    cut = mosaic[: down * BLOCK, :columns]
-    # A line of the sites of one row is a line of pixels with as many channels: no site has to be picked out.
-    lines = [cut[row :: cfa.rows].reshape(-1, columns // cfa.columns, cfa.columns) for row in range(cfa.rows)]
-    blocks = [cv2.resize(line, (across, down), interpolation=cv2.INTER_AREA) for line in lines]
-    return [block.reshape(down, across, -1)[..., column] for block in blocks for column in range(cfa.columns)]

@@ -8,8 +8,8 @@ from jaxtyping import UInt16
 
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile
-from udccal.restoration.backscatter import BLOCK, PERCENTILE, SIGMAS
 from udccal.restoration.linear import scalar, variance_floor_e2
+from udccal.restoration.panel_mask import BLOCK, PERCENTILE, SIGMAS
 from udccal.rig import Camera
 
 # Cameras round their exposures.

@@ -19,7 +19,6 @@ from jaxtyping import Bool, Float64
 
 from udccal.cfa import Cfa, cfa_named
 from udccal.models.noise import Noise
-from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.clipped import QUICK, THOROUGH, Effort, clipped_tiles, completed
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
@@ -27,6 +26,7 @@ from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.linear import to_electrons, variance_e2
 from udccal.restoration.mosaic_filter import filtered_and_joined
 from udccal.restoration.network import corrected, noise_planes
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview

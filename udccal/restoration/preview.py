@@ -17,10 +17,10 @@ from jaxtyping import Array, Float32, UInt8, UInt16
 
 from udccal.cfa import Cfa
 from udccal.models.noise import Noise
-from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.blind import BlindSamples
 from udccal.restoration.defects import without_defects
 from udccal.restoration.linear import above_dark_DN, scalar
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.rectify import Interpolation, Rectification
 from udccal.restoration.tone import CODES, Tone
 

@@ -22,7 +22,7 @@ from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
-from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
+from udccal.restoration.backscatter import PanelLight, refuse_excess
 from udccal.restoration.blind import BlindSamples
 from udccal.restoration.checks import check_exposure, check_frame, check_panel_picture
 from udccal.restoration.dark_places import plausible
@@ -30,6 +30,7 @@ from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.linear import saturated, to_electrons, variance_e2
+from udccal.restoration.panel_mask import PanelMask, mask_mosaic
 from udccal.restoration.plan import PlanOptions, checked_options, kernel_grid
 from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview
@@ -58,12 +59,14 @@ class SceneLight:
         variance_e2: of its noise in e-^2.
         clipped: samples whose light was more than they say.
         panel_error_e: sigma of the panel's light that was taken off, in e-; None where it is 0 or not known.
+        levels: of the panel, as the frame shows them; None where the panel's picture is known, or nothing comes of it.
     """
 
     signal_e: Mosaic
     variance_e2: Mosaic
     clipped: Bool[np.ndarray, "rows columns"]
     panel_error_e: Mosaic | None
+    levels: Float32[np.ndarray, "3"] | None
 
 
 @dataclass(frozen=True)
@@ -227,9 +230,12 @@ class Restorer:
         if self.sharpener is None:
             seen, rectification = self._seen
             return rectification.apply(demosaic(light.signal_e[seen], self.rig.camera.cfa, _PREVIEW_DETAIL))
+        inner = self.sharpener.layout.inner
         sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
+        if light.levels is not None and self.mask is not None:
+            sharp = self.mask.put_back(sharp, light.levels, inner.start, exposure_s, self.noise)
         if light.panel_error_e is not None:
-            sharp = plausible(sharp, light.panel_error_e[self.sharpener.layout.inner])
+            sharp = plausible(sharp, light.panel_error_e[inner])
         return self.strip_rectification.apply(sharp, self.options.interpolation)
 
     def scene_light(
@@ -253,15 +259,18 @@ class Restorer:
             variance /= wire
             variance /= wire
         clipped = saturated(mosaic, self.noise)
-        panel_error_e: Mosaic | None = None
+        panel_error_e, levels = None, None
         if self.mask is not None:
-            panel_e = self._panel_light_e(signal, self.mask, exposure_s, panel_picture)
-            if panel_picture is not None:
+            if panel_picture is None or self.panel is None:
+                levels = self.mask.levels(signal, exposure_s, self.noise)
+                panel_e = np.float32(exposure_s) * self.mask.rate(levels)
+            else:
+                panel_e = np.float32(exposure_s) * self.panel.rate(panel_picture)
                 refuse_excess(signal, panel_e, clipped)
             signal -= panel_e
             if self.mask.error > 0:
                 panel_error_e = np.float32(self.mask.error) * panel_e
-        return SceneLight(signal, variance, clipped, panel_error_e)
+        return SceneLight(signal, variance, clipped, panel_error_e, levels)
 
     def display(
         self,
@@ -298,18 +307,6 @@ class Restorer:
         check_frame(mosaic, exposure_s, self.rig)
         sensor_e = demosaic(to_electrons(mosaic, self.noise, exposure_s), self.rig.camera.cfa)
         return self.rectification.apply(sensor_e) / np.float32(exposure_s)
-
-    def _panel_light_e(
-        self,
-        signal: Mosaic,
-        mask: PanelMask,
-        exposure_s: float,
-        panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
-    ) -> Mosaic:
-        exposure = np.float32(exposure_s)
-        if panel_picture is None or self.panel is None:
-            return exposure * mask.rate(mask.levels(signal, exposure_s, self.noise))
-        return exposure * self.panel.rate(panel_picture)
 
     @functools.cached_property
     def blind(self) -> BlindSamples:

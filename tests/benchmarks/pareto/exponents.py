@@ -18,8 +18,8 @@ import numpy as np
 from tests.benchmarks.pareto.restoring import Setup, Taken
 from tests.benchmarks.rows import Row, at_most
 from udccal.cfa import cfa_named
-from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.mosaic_filter import filtered
+from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.runtime import Restorer

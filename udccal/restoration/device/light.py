@@ -12,11 +12,12 @@ from jaxtyping import Array, Bool, Float, Int, UInt8, UInt16
 
 from udccal.cfa import Cfa
 from udccal.models.noise import Noise, linear_signal
-from udccal.restoration.backscatter import BLOCK, PERCENTILE, SIGMAS, SPARSE, STRIPS
+from udccal.restoration.backscatter import SPARSE
 from udccal.restoration.dark_places import COLOURFUL, LEAST_E, NEGLIGIBLE, STEP
 from udccal.restoration.defects import OUTLIER_RATIO, OUTLIER_SIGMA
 from udccal.restoration.device.planes import Mosaic, apart, box_mean, resized, together
 from udccal.restoration.mosaic_filter import channels_of
+from udccal.restoration.panel_mask import BLOCK, PERCENTILE, SIGMAS, STRIPS
 
 _AROUND = tuple((down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1))
 
@@ -40,10 +41,10 @@ class FrontEnd(eqx.Module):
 
     def light(
         self, mosaic: UInt16[Array, "rows columns"], exposed: Float[Array, "3"], known: Bool[Array, ""], rate: Mosaic
-    ) -> tuple[Mosaic, Mosaic, Bool[Array, "rows columns"], Mosaic, Float[Array, "3"]]:
+    ) -> tuple[Mosaic, Mosaic, Bool[Array, "rows columns"], Mosaic, Float[Array, "3"], Float[Array, "3"]]:
         """Return signal, variance, clipped samples and the panel's light as ``Restorer.scene_light`` does, in e-.
 
-        The last are arguments of ``refuse_excess_of``.
+        Then follow the panel's levels, 0 where its picture is known, and arguments of ``refuse_excess_of``.
 
         Args:
             mosaic: rows of a frame in DN. exposed: exposure in s, DN and variance in e-^2 of a sample without light.
@@ -55,14 +56,36 @@ class FrontEnd(eqx.Module):
         variance = jnp.maximum(signal, 0) + floor_e2
         if self.wire is not None:
             signal, variance = signal / self.wire, variance / self.wire / self.wire
-        panel = jnp.zeros_like(signal)
+        panel, levels = jnp.zeros_like(signal), jnp.zeros(3, signal.dtype)
         if self.white is not None:
-            given = signal, self.white, exposure_s, floor_e2
-            panel = exposure_s * jax.lax.cond(known, lambda: rate, lambda: self._unknown(*given))
+            white, given, none = self.white, (signal, exposure_s, floor_e2), levels
+            levels = jax.lax.cond(known, lambda: none, lambda: self._levels(*given))
+            panel = exposure_s * jax.lax.cond(known, lambda: rate, lambda: self._of_mask(levels, white))
         use = ~clipped[SPARSE]
         sums = (jnp.sum(light[SPARSE], where=use) for light in (signal, panel))
         excess = jnp.stack([*sums, jnp.count_nonzero(use)])
-        return signal - panel, variance, clipped, panel, excess
+        return signal - panel, variance, clipped, panel, levels, excess
+
+    def put_back(
+        self, picture_e: Float[Array, "3 some_rows columns"], levels: Float[Array, "3"], first: int, exposed: Array
+    ) -> Float[Array, "3 some_rows columns"]:
+        """Return a deblurred picture with the light that was too much to subtract, as ``PanelMask.put_back`` does.
+
+        Args:
+            picture_e: light in e-. levels: at which backscatter was subtracted; 0 leaves the picture as it is.
+            first: row of the picture, among those of the mask. exposed: as for ``light``.
+        """
+        if self.white is None:
+            return picture_e
+        exposure_s, _, floor_e2 = exposed
+        rows, columns = picture_e.shape[1:]
+        white = self._blocks(self.white)[:, first // BLOCK :][:, : max(rows // BLOCK, 1)]
+        seen = (
+            resized(picture_e, (white.shape[1], white.shape[2]), cv2.INTER_AREA)
+            + exposure_s * levels[:, None, None] * white
+        )
+        too_much = jnp.maximum(levels - self._highest(seen, white, exposure_s, floor_e2), 0)
+        return picture_e + resized(exposure_s * too_much[:, None, None] * white, (rows, columns), cv2.INTER_LINEAR)
 
     def _electrons(self, value_DN: Float[Array, "*n"], dark_DN: Float[Array, ""]) -> Float[Array, "*n"]:
         black = self.noise.black_DN
@@ -85,24 +108,40 @@ class FrontEnd(eqx.Module):
 
         return jax.lax.cond(jnp.any(wrong), mended, lambda: signal_e)
 
-    def _unknown(
-        self, signal: Mosaic, white: Mosaic, exposure_s: Float[Array, ""], floor_e2: Float[Array, ""]
-    ) -> Mosaic:
-        """Return the mask at the levels that ``PanelMask.levels`` finds, in e-/s."""
-        cfa, channels = self.cfa, channels_of(self.cfa)
-        down, across = (max(most // BLOCK, 1) for most in signal.shape)
-        cut = np.s_[: down * BLOCK, : across * BLOCK]
-        both = [resized(apart(light[cut], cfa), (down, across), cv2.INTER_AREA) for light in (signal, white)]
-        levels = []
-        for channel in range(3):
-            seen, possible = (each[channels == channel].mean(axis=0) for each in both)
-            samples = np.count_nonzero(channels == channel) * min(BLOCK**2, signal.size) / len(channels)
+    def _levels(self, signal: Mosaic, exposure_s: Float[Array, ""], floor_e2: Float[Array, ""]) -> Float[Array, "3"]:
+        """Return the levels that ``PanelMask.levels`` finds."""
+        assert self.white is not None
+        return self._highest(self._blocks(signal), self._blocks(self.white), exposure_s, floor_e2)
+
+    def _of_mask(self, levels: Float[Array, "3"], white: Mosaic) -> Mosaic:
+        """Return the mask at these levels, in e-/s."""
+        return together(levels[channels_of(self.cfa), None, None] * apart(white, self.cfa), self.cfa)
+
+    def _blocks(self, mosaic: Mosaic) -> Float[Array, "3 down across"]:
+        """Return each colour's mean in blocks."""
+        down, across = (max(most // BLOCK, 1) for most in mosaic.shape)
+        sites, channels = apart(mosaic[: down * BLOCK, : across * BLOCK], self.cfa), channels_of(self.cfa)
+        blocks = resized(sites, (down, across), cv2.INTER_AREA)
+        return jnp.stack([blocks[channels == channel].mean(axis=0) for channel in range(3)])
+
+    def _highest(
+        self,
+        seen_e: Float[Array, "3 down across"],
+        white: Float[Array, "3 down across"],
+        exposure_s: Float[Array, ""],
+        floor_e2: Float[Array, ""],
+    ) -> Float[Array, "3"]:
+        """Return the highest levels that light in blocks allows."""
+        assert self.white is not None
+        channels, levels = channels_of(self.cfa), []
+        for channel, (seen, possible) in enumerate(zip(seen_e, white, strict=True)):
+            samples = np.count_nonzero(channels == channel) * min(BLOCK**2, self.white.size) / len(channels)
             seen += SIGMAS * jnp.sqrt((jnp.maximum(seen, 0) + floor_e2) / samples)
             ratio = jnp.where(possible > 0, seen / (possible * exposure_s), jnp.nan).ravel()
             strips = jnp.array_split(ratio, min(STRIPS, ratio.size))
             lowest = jnp.nanmin(jnp.stack([jnp.nanpercentile(strip, PERCENTILE) for strip in strips]))
             levels.append(jnp.clip(jnp.nan_to_num(lowest), 0, 1))
-        return together(jnp.stack(levels)[channels, None, None] * apart(white, cfa), cfa)
+        return jnp.stack(levels)
 
 
 class PanelTables(eqx.Module):

@@ -55,10 +55,11 @@ class _Stages(eqx.Module):
     ) -> tuple[UInt8[Array, "view_rows view_columns 3"], Float[Array, "3"]]:
         """Return what a display shows of some rows, and the arguments of ``refuse_excess_of``."""
         with jax.default_matmul_precision("highest"):
-            signal, variance, clipped, panel, excess = self.front.light(raw, exposed, known, rate)
-            sharp = self._sharp(signal, variance, clipped)
+            signal, variance, clipped, panel, levels, excess = self.front.light(raw, exposed, known, rate)
+            inner = self.tiles.layout.inner
+            sharp = self.front.put_back(self._sharp(signal, variance, clipped), levels, inner.start, exposed)
             if self.error > 0:
-                sharp = plausible(sharp, self.error * panel[self.tiles.layout.inner])
+                sharp = plausible(sharp, self.error * panel[inner])
             # The table of ``Tone.rgb8``.
             steps = jnp.round(resampled(sharp, *self.maps) * scale * (len(CODES) - 1))
             return jnp.asarray(CODES)[jnp.clip(steps, 0, len(CODES) - 1).astype(jnp.int32)], excess
