@@ -18,14 +18,13 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
+from tests.benchmarks.memory import peak_MiB, reset_peak
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone
 from udccal.simulation.scene import WHITE_E_PER_S
 from udccal.tiers import Tier
 
-# The system's counters of this process; writing 5 sets the peak of its memory back.
-_STATUS, _RESET, _RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs"), "5"
 # The numbers of a tone do not matter to its time.
 _TONE = Tone(1 / WHITE_E_PER_S)
 
@@ -120,13 +119,3 @@ def _restored(setup: Setup, taken: Taken) -> Restored:
         _TONE.rgb8(linear)
     cost = Cost(1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - busy), peak_MiB())
     return Restored(restorer.restore(*given) if setup.tier is Tier.preview else linear, cost)
-
-
-def reset_peak() -> None:
-    _RESET.write_text(_RESET_PEAK)
-
-
-def peak_MiB() -> float:
-    """Peak of the resident memory since it was set back."""
-    lines = _STATUS.read_text().splitlines()
-    return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
+from tests.benchmarks.memory import peak_MiB, reset_peak
 from tests.benchmarks.pareto.exponents import Growth, growth_rows
-from tests.benchmarks.pareto.restoring import peak_MiB, reset_peak
 from tests.benchmarks.pareto.starts import Start, start_rows, to_first_line_s
 from udccal.tiers import Tier
 

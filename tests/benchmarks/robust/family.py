@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from tests.benchmarks.memory import peak_MiB, reset_peak
 from udccal.errors import UdccalError
 from udccal.result import FitResult
 
@@ -71,18 +72,23 @@ class Answer:
 
 @dataclass(frozen=True)
 class Case:
-    """One data set: what was drawn, and the function that makes it and fits it."""
+    """One data set: what was drawn, and the function that makes it and fits it.
+
+    ``work`` is how large it is, in units of what the family's limits of time and memory are stated for.
+    """
 
     what: str
     answer: Callable[[], Answer]
     sound: bool = True
+    work: float = 1.0
 
 
 @dataclass(frozen=True)
 class Family:
     """Where data sets come from, and what their fits may cost.
 
-    ``most_refused`` is the part of the sound data sets that may end in an error or a bad status.
+    ``most_refused`` is the part of the sound data sets that may end in an error or a bad status. Time may grow with a
+    data set's ``work``; memory counts of data sets up to 1.
     """
 
     name: str
@@ -115,6 +121,8 @@ class Verdict:
     why: str
     numbers: tuple[Number, ...]
     cpu_s: float
+    peak_MiB: float
+    work: float = 1.0
 
     @property
     def ok(self) -> bool:
@@ -124,6 +132,7 @@ class Verdict:
 
 def judge(case: Case, seed: int) -> Verdict:
     """Run a case and judge what it says."""
+    reset_peak()
     start = time.process_time()
     try:
         answer = case.answer()
@@ -135,7 +144,8 @@ def judge(case: Case, seed: int) -> Verdict:
         place = traceback.extract_tb(error.__traceback__)[-1]
         found = f"{type(error).__name__}: {error} ({place.name}, line {place.lineno})"
         kind, size, why, numbers = Kind.RAW_ERROR, math.inf, found, ()
-    return Verdict(seed, case.what, case.sound, kind, size, why, numbers, time.process_time() - start)
+    cost = time.process_time() - start, peak_MiB()
+    return Verdict(seed, case.what, case.sound, kind, size, why, numbers, *cost, case.work)
 
 
 def _judged(answer: Answer) -> tuple[Kind, float, str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import multiprocessing
-import resource
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -47,11 +46,11 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.family or MODULES:
         parts = [seeds[first : first + _IN_A_PROCESS] for first in range(0, len(seeds), _IN_A_PROCESS)]
-        # In processes of their own: the peak of memory is the family's, and compilations do not pile up.
+        # In processes of their own: compilations do not pile up.
         spawn = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(options.workers, spawn, max_tasks_per_child=1) as pool:
-            judged, peaks_MiB = zip(*pool.map(partial(run, name, only_worst=options.only_worst), parts), strict=True)
-        found = rows_of(family(name), [verdict for part in judged for verdict in part], max(peaks_MiB))
+            judged = pool.map(partial(run, name, only_worst=options.only_worst), parts)
+            found = rows_of(family(name), [verdict for part in judged for verdict in part])
         print(f"{table(found)}\n", flush=True)
         rows += found
         write_json(rows, options.out / "robust.json")
@@ -67,15 +66,15 @@ def family(name: str) -> Family:
     return found
 
 
-def run(name: str, seeds: Iterable[int], only_worst: bool) -> tuple[list[Verdict], float]:
-    """The verdicts of a family, and the peak of memory in MiB."""
+def run(name: str, seeds: Iterable[int], only_worst: bool) -> list[Verdict]:
+    """The verdicts of a family."""
     drawn, verdicts = family(name), list[Verdict]()
     for seed in seeds:
         found = judge(drawn.draw(seed), seed)
         verdicts.append(found)
         if not (only_worst and found.ok):
             print(f"{name}/{seed}: {found.kind.name} {found.size:.1f} {found.why} [{found.what}]", flush=True)
-    return verdicts, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return verdicts
 
 
 def again(name: str, seed: int) -> bool:
@@ -87,7 +86,7 @@ def again(name: str, seed: int) -> bool:
     return found.ok
 
 
-def rows_of(drawn: Family, verdicts: list[Verdict], peak_MiB: float) -> list[Row]:
+def rows_of(drawn: Family, verdicts: list[Verdict]) -> list[Row]:
     """The rows of a family: what was silent, raw or not finite, the worst seeds, and what it cost."""
     name, count = drawn.name, len(verdicts)
     rows = [
@@ -100,10 +99,12 @@ def rows_of(drawn: Family, verdicts: list[Verdict], peak_MiB: float) -> list[Row
         rows.append(at_most(f"{name}: sound data refused", refused, most, f"of {len(sound)}"))
     rows += _over_bound(name, verdicts)
     if drawn.most_cpu_s < np.inf:
-        slowest = max(verdicts, key=lambda one: one.cpu_s)
-        rows.append(at_most(f"{name}/{slowest.seed}: slowest", slowest.cpu_s, drawn.most_cpu_s, "CPU-s"))
-    if drawn.most_MiB < np.inf:
-        rows.append(at_most(f"{name}: peak of memory", peak_MiB, drawn.most_MiB, "MiB"))
+        slowest = max(verdicts, key=lambda one: one.cpu_s / max(one.work, 1.0))
+        limit_s = drawn.most_cpu_s * max(slowest.work, 1.0)
+        rows.append(at_most(f"{name}/{slowest.seed}: slowest, {slowest.what[:30]}", slowest.cpu_s, limit_s, "CPU-s"))
+    if drawn.most_MiB < np.inf and (usual := [one for one in verdicts if one.work <= 1.0]):
+        largest = max(usual, key=lambda one: one.peak_MiB)
+        rows.append(at_most(f"{name}/{largest.seed}: peak of memory", largest.peak_MiB, drawn.most_MiB, "MiB"))
     worst = sorted(verdicts, key=lambda one: one.size, reverse=True)[:_LISTED]
     # JSON has no infinity: an error without a number of sigma is a thousand.
     rows += [at_most(f"{name}/{one.seed}: {one.why[:60]}", min(one.size, 1e3), WORST_Z, "sigma") for one in worst]

@@ -36,7 +36,7 @@ def draw(seed: int) -> Case:
     what = (
         f"{name}, {count} of {size} px, {light_e:.0f} e-, background {background[0]:.0f} e-, {wrong or 'nothing'} wrong"
     )
-    return Case(what, answer, sound)
+    return Case(what, answer, sound, work=count / 60)
 
 
 def _broken(stamps: Stamps, wrong: str, rng: np.random.Generator) -> Stamps:
@@ -68,4 +68,5 @@ def _answer(data: Drawn) -> Answer:
     return Answer(True, result.notes, numbers, all_finite(found, stated, z, result.cov, result.chi2_dof))
 
 
+# Limits of a fit of 60 stamps.
 FAMILY = Family("stamps", draw, most_cpu_s=15.0, most_MiB=1024.0)

@@ -55,17 +55,36 @@ def test_a_raw_error_is_rejected() -> None:
     found = judge(Case("a case", raising(ZeroDivisionError("division by zero"))), 0)
     assert found.kind is Kind.RAW_ERROR
     assert not found.ok
-    assert not all(row.ok for row in rows_of(Family("a", lambda seed: Case("", lambda: GOOD)), [found], 0.0))
+    assert not all(row.ok for row in rows_of(Family("a", lambda seed: Case("", lambda: GOOD)), [found]))
 
 
 def test_rows_reject_wide_sigmas_and_refusals() -> None:
     drawn = Family("a", lambda seed: Case("", lambda: GOOD))
     good = [judge(Case("a case", lambda: GOOD), seed) for seed in range(20)]
-    assert all(row.ok for row in rows_of(drawn, good, 0.0))
+    assert all(row.ok for row in rows_of(drawn, good))
     wide = replace(GOOD, numbers=(Number("a", 0.1, 0.2, 0.1),))
-    assert not all(row.ok for row in rows_of(drawn, [judge(Case("", lambda: wide), 0)], 0.0))
+    assert not all(row.ok for row in rows_of(drawn, [judge(Case("", lambda: wide), 0)]))
     refused = [judge(Case("", raising(FitError("No."))), seed) for seed in range(2)]
-    assert not all(row.ok for row in rows_of(drawn, [*good, *refused], 0.0))
+    assert not all(row.ok for row in rows_of(drawn, [*good, *refused]))
+
+
+@pytest.mark.parametrize(
+    ("cpu_s", "MiB", "work", "missed"),
+    [
+        (14.0, 90.0, 1.0, 0),
+        (16.0, 90.0, 1.0, 1),
+        (16.0, 90.0, 0.3, 1),
+        (19.0, 90.0, 1.33, 0),
+        (21.0, 90.0, 1.33, 1),
+        (14.0, 101.0, 1.0, 1),
+        (14.0, 101.0, 1.33, 0),
+    ],
+)
+def test_rows_reject_what_costs_more_than_its_size_allows(cpu_s: float, MiB: float, work: float, missed: int) -> None:
+    drawn = Family("a", lambda seed: Case("", lambda: GOOD), most_cpu_s=15.0, most_MiB=100.0)
+    good = replace(judge(Case("a case", lambda: GOOD), 0), cpu_s=1.0, peak_MiB=1.0)
+    dear = replace(good, cpu_s=cpu_s, peak_MiB=MiB, work=work)
+    assert sum(not row.ok for row in rows_of(drawn, [good, dear])) == missed
 
 
 @pytest.mark.parametrize(
