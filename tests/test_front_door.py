@@ -64,3 +64,29 @@ def test_a_capture_takes_names_of_terms_alone_and_leaves_no_session_for_others(t
                 udccal.capture(tmp_path / "session", bench, terms)
         assert not (tmp_path / "session").exists()
         assert udccal.capture(tmp_path / "session", bench, "noise").steps("noise")
+
+
+_REFUSALS = """
+import inspect, udccal
+for name in {names}:
+    function = getattr(udccal, name)
+    needed = [one for one in inspect.signature(function).parameters.values() if one.default is one.empty]
+    for given in (None, 3, "session", [[1.0, 2.0]]):
+        try:
+            function(*[given] * len(needed))
+            print(name, given, "was accepted")
+        except udccal.UdccalError as error:
+            if "found" not in str(error):
+                print(name, given, error)
+"""
+
+
+def test_what_is_of_another_kind_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    """Paths for sessions and profiles are what people try first. A process of its own has no check of types."""
+    names = ["calibrate", "capture", "compare_sessions", "deblur", "diff", "fit", "load_profile", "load_rig"]
+    names += ["restore", "save_profile", "simulate", "validate"]
+    names += [f"fit_{term}" for term in ("backscatter", "geometry", "noise", "psf", "wire")]
+    command = [sys.executable, "-c", _REFUSALS.format(names=names)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert (done.returncode, done.stdout, done.stderr[-2000:]) == (0, "", "")
+    assert not list(tmp_path.iterdir())

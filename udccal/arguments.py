@@ -1,7 +1,8 @@
-"""Checks of what a caller gives: numbers, counts and arrays. Each refusal is one sentence, and what to do."""
+"""Checks of what a caller gives: objects, paths, numbers and arrays. Each refusal is one sentence, and what to do."""
 
 from __future__ import annotations
 
+import os
 from typing import Final, Literal
 
 import numpy as np
@@ -23,6 +24,32 @@ def found_instead(value: object) -> str:
     """What an argument is that should have been an array, for a message: type and shape."""
     kind, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     return type(value).__name__ if kind is None else f"{kind} of shape {shape}"
+
+
+def check_kind(value: object, kind: type, advice: str, error: type[UdccalError]) -> None:
+    """Refuse what is no object of a class.
+
+    Args:
+        value: what was given.
+        kind: the class.
+        advice: how to get such an object, a sentence.
+        error: kind of the error.
+
+    Raises:
+        UdccalError: of that kind, with the class of what was given.
+    """
+    if not isinstance(value, kind):
+        raise error(f"Expected a {kind.__name__}, found {_shown(value)}. {advice}")
+
+
+def check_is_path(value: object, what: str, error: type[UdccalError]) -> None:
+    """Refuse what is no path.
+
+    Raises:
+        UdccalError: of the kind ``error``; ``what`` names what the path is of.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise error(f"Expected the path of {what}, found {_shown(value)}. Give a str or a Path.")
 
 
 def check_number(value: object, what: str, bounds: tuple[float, float], advice: str, error: type[UdccalError]) -> None:

@@ -11,8 +11,9 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float
 
+from udccal.arguments import check_kind
 from udccal.effort import FitEffort
-from udccal.errors import UdccalError
+from udccal.errors import SessionError, UdccalError
 from udccal.fitting.geometry.data import BoardView
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
@@ -131,9 +132,10 @@ def fit(session: Session, term: str, effort: FitEffort | None = None) -> FitResu
         the term with its covariance; a term without steps is the same as from ``calibrate``.
 
     Raises:
-        SessionError: when a file of the session is missing or damaged.
+        SessionError: when it is no session, or a file of it is missing or damaged.
         UdccalError: when ``term`` is not the name of a term.
     """
+    _check_session(session)
     if term not in ORDER:
         raise UdccalError(f"Expected a term, one of {', '.join(ORDER)}, found '{term}'. Name one of these.")
     return getattr(TermFits(session, effort), term)
@@ -174,6 +176,7 @@ def calibrate(
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
+    _check_session(session)
     effort = effort or FitEffort()
     base = foundation or fit_foundation(session, progress, effort)
     fits = TermFits(session, effort, progress)
@@ -183,3 +186,7 @@ def calibrate(
         late = [pool.submit(getattr, fits, term) for term in ("psf", "backscatter")]
     times = sorted(fits.times, key=lambda taken: ORDER.index(taken.term))
     return Calibration(session, base, late[0].result(), late[1].result(), (*base.times, *times))
+
+
+def _check_session(session: object) -> None:
+    check_kind(session, Session, "Open a folder by udccal.Session.open(path).", SessionError)

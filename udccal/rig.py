@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
+from udccal.arguments import check_is_path
 from udccal.errors import RigError
 from udccal.io.reading import reading
 from udccal.rig_folders import RIG_FILE, find_rig
@@ -203,6 +204,7 @@ def load_rig(name_or_path: str | Path) -> RigDescription:
     Raises:
         RigError: when there is no such rig, the file is not TOML, or a value is missing, unknown or out of range.
     """
+    check_is_path(name_or_path, "a rig", RigError)
     file = find_rig(name_or_path) / RIG_FILE
     with reading(file, RigError):
         raw = file.read_bytes()

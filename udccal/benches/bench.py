@@ -6,11 +6,13 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
+from udccal.arguments import check_kind
 from udccal.arrangements import Stage
 from udccal.cameras.protocol import Camera
 from udccal.cameras.simulated import SimulatedCamera
 from udccal.displays.protocol import Display
 from udccal.displays.simulated import SimulatedDisplay
+from udccal.errors import RigError
 from udccal.rig import RigDescription
 from udccal.sessions.writer import Now
 from udccal.simulation.truth import draw_truth
@@ -62,4 +64,5 @@ def simulate(rig: RigDescription, seed: int = 0, noise_seed: int | None = None) 
     Returns:
         a context that opens the bench: camera, display, stage and clock. Simulated exposures take no real time.
     """
+    check_kind(rig, RigDescription, "Read one by udccal.load_rig(name).", RigError)
     return simulated_bench(simulated_rig(rig, seed, noise_seed))

@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
+from udccal.arguments import check_is_path, check_kind
 from udccal.benches.bench import CaptureBench
-from udccal.errors import UdccalError
+from udccal.errors import CameraError, SessionError, UdccalError
 from udccal.plugins import find_procedure
 from udccal.sessions.changes import Exchanged
 from udccal.sessions.schema import TermName
@@ -45,6 +46,8 @@ def capture(
         CaptureError: when the camera does not see what a step needs.
         SessionError: when the folder holds another rig's or camera's session, or another process writes to it.
     """
+    check_is_path(path, "a session", SessionError)
+    check_kind(bench, CaptureBench, "Open one by udccal.simulate(rig), or of your own devices.", CameraError)
     wanted = {terms} if isinstance(terms, str) else set(terms)
     if unknown := wanted - set(TERMS):
         raise UdccalError(f"Expected terms, of {', '.join(TERMS)}, found '{min(unknown)}'. Name some of these.")

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+from udccal.arguments import check_kind
 from udccal.errors import ProfileError, SessionError
 from udccal.profiles.profile import Profile
 from udccal.rig import RigDescription
@@ -20,6 +21,8 @@ def check_comparable(a: Profile, b: Profile) -> None:
     Raises:
         ProfileError: when rig, panel, sensor or camera differ; the message names the first difference.
     """
+    for profile in (a, b):
+        check_kind(profile, Profile, "Read a folder by udccal.load_profile(path).", ProfileError)
     if (found := _difference(a.rig, a.provenance.camera, b.rig, b.provenance.camera)) is not None:
         what, first, second = found
         raise ProfileError(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from udccal.arguments import check_is_path, check_kind
 from udccal.errors import ProfileError, RigError
 from udccal.io.atomic import write_atomically
 from udccal.io.exr import check_path
@@ -59,6 +60,8 @@ def save_profile(profile: Profile, path: str | Path) -> Path:
         ProfileError: as ``write_profile``.
         UdccalError: when it cannot be written.
     """
+    check_kind(profile, Profile, "Take a calibration's profile.", ProfileError)
+    check_is_path(path, "a profile", ProfileError)
     target = Path(path)
     with storing_in(target.parent):
         write_profile(target, profile)
@@ -105,6 +108,7 @@ def load_profile(name_or_path: str | Path) -> Profile:
     Raises:
         ProfileError: as ``read_profile``.
     """
+    check_is_path(name_or_path, "a profile", ProfileError)
     return read_profile(find_profile(name_or_path))
 
 

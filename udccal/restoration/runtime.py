@@ -14,8 +14,9 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
+from udccal.arguments import check_kind
 from udccal.cfa import cfa_named
-from udccal.errors import RestorationError
+from udccal.errors import ProfileError, RestorationError
 from udccal.kernels import fitted_size
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
@@ -144,6 +145,7 @@ class Restorer:
             RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
                 finite, there is no such tier, or options are no ``PlanOptions``.
         """
+        check_kind(profile, Profile, "Read a folder by udccal.load_profile(path).", ProfileError)
         options, tier, keep = checked_options(options), tier_named(tier), None if keep is None else Path(keep)
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)

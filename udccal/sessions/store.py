@@ -10,6 +10,7 @@ from typing import TypeVar, final
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
+from udccal.arguments import check_is_path
 from udccal.errors import FileFormatError, MissingStepError, SessionError
 from udccal.io.exr import read_exr
 from udccal.io.hashing import sha256_file
@@ -50,6 +51,7 @@ class Session:
         Raises:
             SessionError: when there is none, or its manifest does not follow docs/session.md.
         """
+        check_is_path(path, "a session", SessionError)
         folder = Path(path)
         return cls(folder, read_manifest(folder))
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import final
 
+from udccal.arguments import check_kind
 from udccal.comparison.comparable import check_sessions
 from udccal.comparison.estimates import ORDER
 from udccal.errors import MissingStepError, SessionError
@@ -60,6 +61,8 @@ def compare_sessions(session: Session, against: Session, limits: ValidationLimit
             file is missing or damaged.
         FitError: when frames are not what a fit takes.
     """
+    for one in (session, against):
+        check_kind(one, Session, "Open a folder by udccal.Session.open(path).", SessionError)
     return compared(session, against, limits or ValidationLimits())[0]
 
 

@@ -7,9 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import final
 
+from udccal.arguments import check_kind
 from udccal.comparison.comparable import check_same_rig
 from udccal.comparison.estimates import ORDER
-from udccal.errors import MissingStepError, SessionError
+from udccal.errors import MissingStepError, ProfileError, SessionError
 from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile
 from udccal.result import FitStatus
@@ -76,6 +77,8 @@ def validate(profile: Profile, session: Session, limits: ValidationLimits | None
         SessionError: when a file of the session is missing or damaged, or no term can be judged.
         FitError: when frames or boards are not what a fit takes.
     """
+    check_kind(profile, Profile, "Read a folder by udccal.load_profile(path).", ProfileError)
+    check_kind(session, Session, "Open a folder by udccal.Session.open(path).", SessionError)
     return judge(profile, session, limits or ValidationLimits())[0]
 
 

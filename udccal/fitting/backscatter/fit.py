@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import block_diag
 
+from udccal.arguments import check_kind
+from udccal.errors import FitError
 from udccal.fitting.backscatter.checks import check_grid
 from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_rays, grid_step
 from udccal.fitting.backscatter.misfits import Brightness, brightness, disagreement, residual_pattern
@@ -74,6 +76,7 @@ def fit_backscatter(
     Raises:
         FitError: when the data's grid is not that of the rig's sensor.
     """
+    check_kind(data, BackscatterData, "Give the binned rates as one.", FitError)
     check_grid(data.shots, grid_step(rig), rig)
     rules = rules or BackscatterRules()
     keep = data.shots.clipped.mean(axis=(1, 2, 3))[1:-1] <= rules.most_clipped

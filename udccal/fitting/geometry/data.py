@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from udccal.arguments import found_instead
 from udccal.arrangements import BoardSpec
 from udccal.cfa import cfa_named
 from udccal.errors import FitError
@@ -171,6 +172,9 @@ def gather(
     rules: GeometryRules = USUAL,
 ) -> Gathered:
     """Every finite point of every view that determines a pose; arguments and errors as for ``fit_geometry``."""
+    for given in (board, image) if sigmas is None else (board, image, sigmas):
+        if isinstance(given, str) or not isinstance(given, Sequence | np.ndarray):
+            raise FitError(f"Expected points as one array per view, found {found_instead(given)}. Give a list of them.")
     if len({len(board), len(image), len(image if sigmas is None else sigmas)}) > 1:
         raise FitError(
             f"Expected as many views on the board as in pictures (and of sigmas), found {len(board)} and {len(image)}. "
@@ -181,7 +185,11 @@ def gather(
     lost, notes = list[str](), list[str]()
     parts = {-1: (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))}
     for number, arrays in enumerate(zip(board, image, given, strict=True)):
-        points, pixels, own = (np.asarray(one, dtype=np.float64) for one in arrays)
+        try:
+            points, pixels, own = (np.asarray(one, dtype=np.float64) for one in arrays)
+        except (TypeError, ValueError):
+            kinds = ", ".join(found_instead(one) for one in arrays[:2])
+            raise FitError(f"Expected numbers in view {number}, found {kinds}. Give arrays of points.") from None
         n = len(pixels)
         if points.shape not in ((n, 3), (n, 1, 3)) or pixels.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
             raise FitError(

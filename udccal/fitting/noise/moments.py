@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from udccal.arguments import found_instead
+from udccal.arguments import check_kind
 from udccal.errors import FitError
 from udccal.fitting.noise.codes import DarkPair, dark_pair, dark_window
 from udccal.fitting.noise.data import (
@@ -283,8 +283,7 @@ class NoiseMoments:
 
 def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     """All frames as moments and histograms for the fit; None without a dark and a bright pair."""
-    if not isinstance(data, NoiseData):
-        raise FitError(f"Expected frames as NoiseData, found {found_instead(data)}. Give it levels of exposure.")
+    check_kind(data, NoiseData, "Give it levels of exposure.", FitError)
     data.check()
     darks, brights = ([of for of in data.levels if len(getattr(of, name))] for name in ("dark", "bright"))
     if not darks or not brights:

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
+from udccal.arguments import check_kind
+from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import SIGNIFICANT
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
@@ -68,6 +70,7 @@ def fit_psf(
         error of the kernel that positions held out show in addition to noise. Data that cannot be fitted give a status
         and a note instead of an exception.
     """
+    check_kind(data, PsfData, "Give the crops as one.", FitError)
     rules = rules or PsfRules()
     data, start = data.known(rules), start_model(rig, geometry, wire, rules)
     unfit = _unfit(data, rig, rules)

@@ -13,6 +13,8 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Float32
 
+from udccal.arguments import check_kind
+from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
@@ -47,6 +49,7 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
         the wire, whose map has a mean of 1, and its posterior: ``result.sigma_of`` gives the sigma of the map at any
         pixels, model error included. The status of a flat that cannot be used says why.
     """
+    check_kind(data, WireData, "Give the average of a flat as one.", FitError)
     rules, shape = rules or WireRules(), data.signal.shape
     refused = unusable_flat(data, rules)
     if refused:
