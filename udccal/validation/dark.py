@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.noise.moments import Moments, NoiseMoments
+from udccal.fitting.noise.frame_moments import Moments
+from udccal.fitting.noise.moments import NoiseMoments
 from udccal.models.noise import Noise, linear_signal
 from udccal.validation.checks import Check
 from udccal.validation.limits import ValidationLimits

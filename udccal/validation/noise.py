@@ -14,7 +14,8 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.noise.data import NoiseData, NoiseRules, read_noise
-from udccal.fitting.noise.moments import Moments, NoiseMoments, reduced, stacked
+from udccal.fitting.noise.frame_moments import Moments, stacked
+from udccal.fitting.noise.moments import NoiseMoments, reduced
 from udccal.fitting.noise.transfer import temporal_variance
 from udccal.models.noise import Noise, linear_signal
 from udccal.profiles.profile import Profile

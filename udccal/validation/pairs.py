@@ -17,7 +17,8 @@ from udccal.cfa import cfa_named
 from udccal.fitting.backscatter.data import grid_step
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.noise.data import NoiseRules, read_noise
-from udccal.fitting.noise.moments import NoiseMoments, reduced, stacked
+from udccal.fitting.noise.frame_moments import stacked
+from udccal.fitting.noise.moments import NoiseMoments, reduced
 from udccal.fitting.wire.data import odd_step, scaled_places
 from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep, TermName
 from udccal.sessions.store import Average, Session

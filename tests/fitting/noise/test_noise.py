@@ -9,7 +9,7 @@ import pytest
 
 from udccal.cameras.protocol import Region
 from udccal.fitting.engine.orders import Quantity
-from udccal.fitting.noise import codes, moments
+from udccal.fitting.noise import codes, frame_moments
 from udccal.fitting.noise.data import Averaged, Codes, NoiseRules
 from udccal.fitting.noise.fit import fit_moments, nominal_noise
 from udccal.fitting.noise.moments import NoiseMoments, converter_step
@@ -25,8 +25,8 @@ STACK = 12
 RULES = NoiseRules()
 
 
-def reduce_pair(first: Codes, second: Codes, exposure_s: float) -> moments.Moments:
-    return moments.reduce_frames([first, second], exposure_s, None, 2, RULES)[1]
+def reduce_pair(first: Codes, second: Codes, exposure_s: float) -> frame_moments.Moments:
+    return frame_moments.reduce_frames([first, second], exposure_s, None, 2, RULES)[1]
 
 
 def toy(name: str, seed: int) -> tuple[RigDescription, Sensor]:

@@ -15,7 +15,8 @@ from udccal.fitting.noise.codes import start_values
 from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain, shared_by_neighbours
-from udccal.fitting.noise.moments import NoiseMoments, bins, reduced, stacked
+from udccal.fitting.noise.frame_moments import bins, stacked
+from udccal.fitting.noise.moments import NoiseMoments, reduced
 from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import Pattern, prnu, rough_median
 from udccal.fitting.noise.stacks import contradiction

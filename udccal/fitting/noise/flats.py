@@ -14,7 +14,8 @@ from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.noise.codes import excess_kurtosis, smeared, standard_cdf
 from udccal.fitting.noise.dark import DarkTerms
-from udccal.fitting.noise.moments import Moments, NoiseMoments, stacked
+from udccal.fitting.noise.frame_moments import Moments, stacked
+from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.neighbours import Shared, pooled
 from udccal.fitting.noise.transfer import DarkVariance, Five, Grid, Levels, TransferFit, robust_transfer
 

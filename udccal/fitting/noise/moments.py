@@ -1,24 +1,17 @@
-"""Frames reduced to the data of the fit: moments per bin of pairs and stacks, and joint histograms of dark codes.
-
-A bin is one site of the colour mosaic in one tile of the sensor. Frames come one by one: their differences from the
-first frame are summed, and the squares of these, so that float32 loses no digits that matter.
-"""
+"""All frames of a noise measurement reduced to the data of the fit: moments, and joint histograms of dark codes."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import final
 
-import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int
 
 from udccal.arguments import check_kind
 from udccal.errors import FitError
-from udccal.fitting.noise.codes import DarkPair, dark_pair, dark_window
+from udccal.fitting.noise.codes import DarkPair, dark_pair
 from udccal.fitting.noise.data import (
     Averaged,
     Codes,
@@ -30,183 +23,7 @@ from udccal.fitting.noise.data import (
     checked_average,
     loaded,
 )
-from udccal.fitting.noise.neighbours import Shared, shared_noise
-
-Grid = Float[np.ndarray, "groups_y groups_x"]
-
-
-@functools.lru_cache(maxsize=8)
-def bins(
-    rows: int, columns: int, period: int
-) -> tuple[Float[np.ndarray, "groups_y rows"], Float32[np.ndarray, "columns groups_x"]]:
-    """Ones where a row and a column belong to a group of bins; colour sites repeat every ``period`` samples."""
-    # Tiles keep shading and a lamp's slow flicker out of the variance: at most 8 a side, each of 4096 samples a colour.
-    tiles = int(np.clip(np.sqrt(rows * columns / period**2 / 4096), 1, 8))
-
-    def groups(length: int) -> Float[np.ndarray, "length groups"]:
-        # Whole mosaic cells per tile; the last tile has the remaining ones.
-        tile = np.minimum(np.arange(length) // period // max(length // period // tiles, 1), tiles - 1)
-        return np.eye(tiles * period)[tile * period + np.arange(length) % period]
-
-    return groups(rows).T.copy(), groups(columns).astype(np.float32)
-
-
-@final
-@dataclass(frozen=True)
-class Moments:
-    """Two or more frames of the same scene; arrays are per bin.
-
-    ``light`` is the relative exposure to light, in any unit common to all levels (photons per pixel, or seconds).
-    ``variance_DN2`` is the temporal variance of one frame, row noise and common changes of brightness removed, and
-    ``dof`` its degrees of freedom; ``samples`` are frames times pixels; ``spread_DN`` is the standard deviation over
-    these, spatial and temporal; ``shift_DN`` is the mean of each frame less that of all. ``rows_DN2`` is the variance
-    of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
-    is the fraction of the samples with the largest code, and ``codes`` the histogram of the first frame. ``outliers``
-    were hits, and left out; ``outlier_powers`` are the sums of the second and fourth powers of their differences from
-    the first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``far`` is how many
-    pixels lie outside the window of the dark histograms in both of these, and what they have of all frames' squares.
-    ``repeated``: some frames are copies of others.
-    """
-
-    exposure_s: float
-    light: float
-    mean_DN: Float[np.ndarray, " bins"]
-    variance_DN2: Float[np.ndarray, " bins"]
-    dof: Float[np.ndarray, " bins"]
-    samples: Float[np.ndarray, " bins"]
-    spread_DN: Float[np.ndarray, " bins"]
-    shift_DN: Float[np.ndarray, "frames bins"]
-    rows_DN2: float
-    sampling_DN2: float
-    height: int
-    peak_DN: int
-    at_peak: Float[np.ndarray, " bins"]
-    codes: Int[np.ndarray, " codes"]
-    outliers: int
-    outlier_powers: tuple[float, float]
-    shared: Shared
-    far: tuple[int, float] = (0, 0.0)
-    repeated: bool = False
-
-    @property
-    def frames(self) -> int:
-        """How many."""
-        return len(self.shift_DN)
-
-    @property
-    def pixels(self) -> float:
-        """Pixels of a frame."""
-        return float(self.samples.sum()) / self.frames
-
-    @property
-    def temporal_DN2(self) -> float:
-        """Temporal variance of all bins."""
-        return float(np.average(self.variance_DN2, weights=self.dof))
-
-    @property
-    def near_DN2(self) -> float:
-        """Temporal variance of the pixels that are not ``far``: hot and dead pixels have noise of their own."""
-        (pixels, squares), dof = self.far, float(self.dof.sum())
-        return (self.temporal_DN2 * dof - squares) / max(dof - (self.frames - 1) * pixels, 1.0)
-
-    @property
-    def outlier_variance_DN2(self) -> float:
-        """What the hits would add to the temporal variance."""
-        return self.outlier_powers[0] / (2 * (self.frames - 1) * self.pixels)
-
-
-def stacked(levels: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels bins"]:
-    """The field ``name`` of every level and bin."""
-    return np.stack([getattr(level, name) for level in levels])
-
-
-def reduce_frames(
-    frames: Iterable[Codes],
-    exposure_s: float,
-    light: float | None,
-    period: int,
-    rules: NoiseRules,
-    dark_step: int | None = None,
-) -> tuple[Averaged, Moments]:
-    """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise.
-
-    ``dark_step`` is the converter's step, of dark frames: pixels beyond the window of the histograms are ``far``.
-    """
-    source = iter(frames)
-    first = next(source)
-    (height, columns), (down, right) = first.shape, bins(*first.shape, period)
-
-    def binned(picture: Float32[np.ndarray, "rows columns"]) -> Grid:
-        return np.asarray(down @ (picture @ right))
-
-    def at_peak(frame: Codes) -> tuple[int, Grid]:
-        return int(top := frame.max()), binned((frame == top).astype(np.float32))
-
-    width = right.sum(axis=0, dtype=np.float64)
-    counts, total = np.outer(down.sum(axis=1), width), np.zeros(first.shape, np.float32)
-    outliers, powers, squares = 0, np.zeros(2), np.zeros_like(counts)
-    shared: Shared | None = None
-    far, apart = np.zeros(0, int), [np.zeros(0)]
-    # Of every frame: its rows' means and its bins' sums less these, as differences from the first frame, and its peak.
-    by_row, by_bin, peaks = [np.zeros(height)], [np.zeros_like(counts)], [at_peak(first)]
-    for frame in source:
-        if dark_step and not shared:
-            middle_DN, reach_DN = dark_step * np.array(dark_window(first, dark_step))
-            far = np.flatnonzero(np.minimum(*(np.abs(one - middle_DN) for one in (first, frame))) > reach_DN)
-            apart = [np.zeros(far.size)]
-        difference = cv2.subtract(frame, first, dtype=cv2.CV_32F)
-        square = cv2.multiply(difference, difference)
-        # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
-        usual = np.median(square[:: max(height // 128, 1)] @ right, axis=0) / width
-        hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
-        hits.ravel()[far] = False  # the shot noise of hot pixels is none
-        if hits.any():
-            large = square[hits].astype(np.float64)
-            outliers, powers = outliers + large.size, powers + np.array([large.sum(), np.square(large).sum()])
-            difference[hits] = 0.0
-        by_row.append(difference.mean(axis=1, dtype=np.float64))
-        difference -= by_row[-1][:, None]
-        shared = shared or shared_noise(first, difference, period)
-        apart.append(difference.ravel()[far].astype(np.float64))
-        total += difference
-        by_bin.append(binned(difference))
-        squares += binned(cv2.multiply(difference, difference))
-        peaks.append(at_peak(frame))
-    number, middle = len(by_row), float(np.median(first[:: max(height // 64, 1)]))
-    rows, left = np.stack(by_row), np.stack(by_bin)
-    mean = cv2.addWeighted(first, 1.0, total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
-    mean += rows.mean(axis=0)[:, None]
-    rows, left = rows - rows.mean(axis=0), left - left.mean(axis=0)
-    dof = np.maximum((number - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
-    squares -= binned(cv2.multiply(total, total, scale=1.0 / number)) + np.square(left).sum(axis=0) / counts
-    # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
-    # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
-    mixed = squares / dof
-    variance = (mixed * (1 - 1 / columns) - (mixed @ width)[:, None] / columns**2) / (1 - 2 / columns)
-    about = cv2.subtract(mean, middle)
-    level = binned(about) / counts
-    spatial = np.maximum(binned(cv2.multiply(about, about)) / counts - level**2, 0.0)
-    peak = max(code for code, _ in peaks)
-    return Averaged(exposure_s, mean, number), Moments(
-        exposure_s=exposure_s,
-        light=exposure_s if light is None else light,
-        mean_DN=(level + middle).ravel(),
-        variance_DN2=variance.ravel(),
-        dof=dof.ravel(),
-        samples=number * counts.ravel(),
-        spread_DN=np.sqrt(spatial + np.maximum(variance, 0.0) * (1 - 1 / number)).ravel(),
-        shift_DN=((left + (rows @ down.T)[..., None] * width) / counts).reshape(number, -1),
-        rows_DN2=float(np.square(rows - rows.mean(axis=1, keepdims=True)).sum()) / ((number - 1) * max(height - 1, 1)),
-        sampling_DN2=float(np.average(variance, weights=counts)) / columns,
-        height=height,
-        peak_DN=peak,
-        at_peak=(sum(count for code, count in peaks if code == peak) / (number * counts)).ravel(),
-        codes=np.bincount(first.ravel()),
-        outliers=outliers,
-        outlier_powers=(float(powers[0]), float(powers[1])),
-        shared=shared or Shared(),
-        far=(far.size, float(np.var(apart, axis=0).sum()) * number),
-    )
+from udccal.fitting.noise.frame_moments import Moments, reduce_frames
 
 
 def fingerprint(frame: Codes) -> int | None:

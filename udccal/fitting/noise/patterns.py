@@ -21,7 +21,8 @@ from scipy.special import ndtri
 from udccal.fitting.engine.misfit import excess_variance
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.noise.moments import Moments, NoiseMoments
+from udccal.fitting.noise.frame_moments import Moments
+from udccal.fitting.noise.moments import NoiseMoments
 
 Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
 Mask = Bool[np.ndarray, "rows columns"]

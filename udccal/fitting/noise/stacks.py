@@ -10,7 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from udccal.fitting.noise.flats import rough_gain, steadied
-from udccal.fitting.noise.moments import Moments, NoiseMoments, stacked
+from udccal.fitting.noise.frame_moments import Moments, stacked
+from udccal.fitting.noise.moments import NoiseMoments
 
 _SORT = "Sort the stack's frames, or leave the stack out."
 
