@@ -79,6 +79,17 @@ def test_dead_lines_and_fixed_offsets_have_no_part_in_the_read_noise(where: slic
         assert abs(z(result, name, truth)) < 4.5, name
 
 
+@pytest.mark.parametrize("order", [(5, 4, 3, 2, 1, 0), (0, 1, 5, 3, 4, 2)])
+def test_dark_frames_with_the_exposure_times_of_others_are_refused(order: tuple[int, ...]) -> None:
+    """The fit took their shot noise for tails of the read noise, and sigma_d was 8 sigma too large."""
+    data = captured(SENSOR, 3)
+    darks, flats = ([of for of in data.levels if len(getattr(of, name))] for name in ("dark", "bright"))
+    mixed = [replace(of, exposure_s=darks[other].exposure_s) for of, other in zip(darks, order, strict=True)]
+    result = fit_noise(replace(data, levels=[*flats, *mixed]))
+    assert result.status is FitStatus.POOR_FIT
+    assert noted(result, "does not rise with exposure")
+
+
 def test_pixels_one_code_off_in_some_frames_are_not_hot() -> None:
     """Of noise of 0.2 code, most pixels have one code in all frames: 10 % of the others were listed as hot."""
     quiet = replace(SENSOR, bits=8, K_DN_per_e=0.02, black_DN=8.0, read_e=10.0, DSNU_e=0.0, dark_e_per_s=0.0)

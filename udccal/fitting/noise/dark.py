@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import chi2
 
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.codes import (
@@ -20,7 +21,7 @@ from udccal.fitting.noise.codes import (
     pair_probability,
     row_gain,
 )
-from udccal.fitting.noise.dark_levels import Means, dark_levels, dark_means
+from udccal.fitting.noise.dark_levels import Means, PerPair, dark_levels, dark_means
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
 
@@ -207,6 +208,29 @@ def unexplained_variance(
     or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the variance over all pixels). Pixels far
     from the others count only where ``of_all`` is True: hot ones have shot noise, dead ones have none.
     """
+    values, variances = _temporal(data, most_hits, of_all)
+    weights = 1.0 / variances
+    return Quantity(float(np.average(values - np.asarray(expected_DN2), weights=weights)), float(1.0 / weights.sum()))
+
+
+def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
+    """Whether temporal noise rises with the mean of dark frames, as dark current's does, but not with exposure.
+
+    Then exposure times are those of other frames. Where black drifts, noise rises with neither.
+    """
+    values, variances = _temporal(data, data.rules.most_hits, dark.skewed)
+    means, times = np.array([(pair.mean_DN, pair.exposure_s) for pair in data.darks]).T
+
+    def off(signal_DN: PerPair) -> float:
+        left = values - dark.K_DN_per_e * signal_DN
+        return float(np.sum((left - np.average(left, weights=1.0 / variances)) ** 2 / variances))
+
+    by_time = off(max(dark.dark_DN_per_s.value, 0.0) * times)
+    return bool(chi2.sf(by_time, len(times) - 1) < data.rules.contradictory and off(means) < 0.1 * by_time)
+
+
+def _temporal(data: NoiseMoments, most_hits: float, of_all: bool) -> tuple[PerPair, PerPair]:
+    """Temporal variance of each dark pair, and its own variance."""
     tails = sum(of.outliers for of in data.dark_moments) > most_hits * sum(of.pixels for of in data.dark_moments)
     values, variances = [], []
     for pair, of in zip(data.darks, data.dark_moments, strict=True):
@@ -214,5 +238,4 @@ def unexplained_variance(
         fourth = (np.sum(pair.counts * pair.differences_DN**4) + tails * of.outlier_powers[1]) / of.pixels
         values.append(value)
         variances.append(max(fourth / 4 - value**2, value**2) / of.pixels)
-    weights = 1.0 / np.maximum(variances, 1e-30)
-    return Quantity(float(np.average(np.subtract(values, expected_DN2), weights=weights)), float(1.0 / weights.sum()))
+    return np.array(values), np.maximum(variances, 1e-30)

@@ -46,6 +46,7 @@ class NoiseRules:
         foreign_sigma: read noise whose measured variance is farther from the fitted distribution's, in sigma, has
             none of the family's distributions.
         most_hits: fraction of pixels that radiation hits at most in a dark pair.
+        contradictory: chance below which the noise of dark frames contradicts their exposure times.
         most_hot: fraction of dark samples that are hot pixels above which a note tells of them.
         most_shared: change of the gain by noise that neighbours share above which the fit is poor.
         worst_chi2: reduced chi-squared above which the sensor is not what the model says.
@@ -65,6 +66,7 @@ class NoiseRules:
     gain_sigma: float = 10.0
     foreign_sigma: float = 3.0
     most_hits: float = 1e-4
+    contradictory: float = 1e-9
     most_hot: float = 1e-3
     most_shared: float = 0.05
     worst_chi2: float = 6.0

@@ -12,7 +12,7 @@ from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.noise.codes import start_values
-from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
+from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms, unlike_exposures
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain, shared_by_neighbours
 from udccal.fitting.noise.frame_moments import bins, stacked
@@ -95,6 +95,9 @@ def fit_moments(data: NoiseMoments, nominal: Noise) -> FitResult[Noise]:
         curve = fit_curve(data, dark)
     if refused := _no_gain(data, dark, curve):
         return FitResult.failed("noise", nominal, *refused)
+    if dark.white and unlike_exposures(data, dark):
+        note = "The noise of dark frames does not rise with exposure as dark current's would. Check exposure times."
+        return FitResult.failed("noise", nominal, FitStatus.POOR_FIT, note)
     return _assembled(data, dark, curve)
 
 
