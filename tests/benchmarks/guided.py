@@ -30,6 +30,7 @@ from udccal.benches.bench import simulated_bench
 from udccal.benches.capture import capture
 from udccal.cli.jobs.fit import fit_to_profile
 from udccal.cli.output import Output
+from udccal.fitting.psf.fit import NOISE_SIGMA
 from udccal.guide.capture import lead_capture
 from udccal.guide.events import Answer
 from udccal.io.atomic import write_atomically
@@ -126,6 +127,11 @@ def judged(pairs: list[Pair]) -> list[Row]:
         median = float(np.median(list(ratios.values())))
         rows.append(at_most(f"{what}, median of {len(ratios)}", median, _MOST_SIGMA, ""))
         rows.append(at_most(f"{what}, worst ({worst})", ratios[worst], _MOST_SIGMA, ""))
+    by_noise = [noise_ratios(pair.commanded.profile.psf, pair.guided.profile.psf) for pair in pairs]
+    ratios = {name: float(np.median([one[name] for one in by_noise])) for name in by_noise[0]}
+    worst = max(ratios, key=lambda name: ratios[name])
+    what = f"psf: sigma by noise alone, guided over commanded, worst of {len(ratios)} ({worst})"
+    rows.append(at_most(what, ratios[worst], _MOST_SIGMA, ""))
     told = [max(same, key=lambda row: row.value) for same in zip(*(pair.errors() for pair in pairs), strict=True)]
     return rows + [replace(row, name=f"guided: {row.name}") for row in told]
 
@@ -138,6 +144,13 @@ def sigma_ratios(commanded: FitResult, guided: FitResult) -> dict[str, float]:
         for name in one
         if name in other and one[name].sigma > 0 and not one[name].by_prior
     }
+
+
+def noise_ratios(one: FitResult, other: FitResult) -> dict[str, float]:
+    """Of the psf's numbers: what the captures tell about them, whatever the model's deviation is found to be."""
+    names = [each.name for each in one.diagnostics if each.name.startswith(NOISE_SIGMA)]
+    found = {name: (one.diagnostic(name), other.diagnostic(name)) for name in names}
+    return {name.removeprefix(NOISE_SIGMA): b / a for name, (a, b) in found.items() if a and b}
 
 
 def main() -> int:

@@ -8,16 +8,18 @@ from pathlib import Path
 import pytest
 
 from tests.benchmarks.draws import Draw
-from tests.benchmarks.guided import Calibrated, Pair, _Counted, judged, sigma_ratios
+from tests.benchmarks.guided import Calibrated, Pair, _Counted, judged, noise_ratios, sigma_ratios
 from udccal.guide.events import Answer, VerdictEvent
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
-from udccal.result import FitResult
+from udccal.result import Diagnostic, FitResult
 
 
 @pytest.fixture(scope="module")
 def shipped() -> Profile:
-    return load_profile("lg55-reduced")
+    profile = load_profile("lg55-reduced")
+    told = *profile.psf.diagnostics, Diagnostic("noise_sigma_depth_mm", 1e-3, "mm")
+    return dataclasses.replace(profile, psf=dataclasses.replace(profile.psf, diagnostics=told))
 
 
 def wider(result: FitResult, by: float) -> FitResult:
@@ -31,6 +33,14 @@ def test_sigmas_are_compared_by_name(shipped: Profile) -> None:
     assert all(ratio == pytest.approx(1.2) for ratio in ratios.values())
     # Its sigma is the rig's tolerance, however an LED is held.
     assert "pitch_mm" not in sigma_ratios(shipped.psf, shipped.psf)
+
+
+def test_what_captures_tell_is_compared_without_the_models_deviation(shipped: Profile) -> None:
+    def known(by: float) -> FitResult:
+        told = Diagnostic("noise_sigma_depth_mm", by * 1e-3, "mm"), Diagnostic("iterations", 7.0, "1")
+        return dataclasses.replace(wider(shipped.psf, 1 / by), diagnostics=told)
+
+    assert noise_ratios(known(1.0), known(1.2)) == pytest.approx({"depth_mm": 1.2})
 
 
 @pytest.mark.medium

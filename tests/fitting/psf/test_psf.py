@@ -122,6 +122,9 @@ def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> No
     # The model has the lowest terms of the interference only: its strength is about 1, and far from 0.
     assert numbers["wire_phase_strength"] == pytest.approx(1.0, abs=0.4)
     assert 0.0 < numbers["efficiency"] <= 1.05
+    # What noise alone would leave open is less than what the model's deviation does.
+    for name in ("column_open", "row_open", "depth_mm", "pupil_diameter_mm"):
+        assert 0.0 < numbers[f"noise_sigma_{name}"] < grating.result.estimate(name).sigma
     # Wave optics has more terms than the model: that is seen, said, and part of what the kernel is off by.
     assert numbers["residual_pattern_p"] < 1e-3
     assert any("have a pattern" in note and "row_open" in note for note in grating.result.notes)

@@ -49,6 +49,9 @@ from udccal.rig import RigDescription
 _DIFFRACTION: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm")
 _BLUR: Final = ("blur_px", "blur_growth_radial", "blur_growth_tangential", "blur_red", "blur_blue")
 _NUMBERS: Final = (*_DIFFRACTION, *_BLUR)
+# Diagnostics that say what sigma would be if the model had no deviation; of these numbers, with their units.
+NOISE_SIGMA: Final = "noise_sigma_"
+_UNITS: Final = (("column_open", "1"), ("row_open", "1"), ("depth_mm", "mm"), ("pupil_diameter_mm", "mm"))
 _LENGTHS: Final = np.isin(_NUMBERS, ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
 
 
@@ -182,6 +185,7 @@ def _report(
     if fit.phase:
         figures["wire_phase_strength"], figures["wire_phase_strength_sigma"] = fit.phase.best.fit
     lengths = zip(("support_rows", "support_columns"), support.half_px, strict=True)
+    by_noise = dict(zip(_NUMBERS, np.sqrt(np.diag(fit.noise_cov)), strict=False)) if diffracts else {}
     off = _said_to_be_off(stated, selection.magnitude) if error.size else ""
     misfit = "" if diffracts else off
     if diffracts and pattern_p <= SIGNIFICANT:
@@ -199,6 +203,7 @@ def _report(
         diagnostics=(
             *(Diagnostic(name, float(value), "1") for name, value in figures.items()),
             *(Diagnostic(name, float(value), "px") for name, value in lengths),
+            *(Diagnostic(f"{NOISE_SIGMA}{name}", float(by_noise[name]), unit) for name, unit in _UNITS if by_noise),
         ),
         notes=_notes(data, diffracts, misfit, support_notes(term, support)),
         outliers=fit.outliers,
