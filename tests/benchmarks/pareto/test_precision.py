@@ -34,7 +34,7 @@ def light() -> SceneLight:
     y, x = np.mgrid[:ROWS, :COLUMNS]
     expected = 3000 + 2000 * np.sin(x / 5) * np.cos(y / 7)
     signal = np.random.default_rng(2).poisson(expected).astype(np.float32)
-    return SceneLight(signal, expected.astype(np.float32), np.zeros(signal.shape, bool), None)
+    return SceneLight(signal, expected.astype(np.float32), np.zeros(signal.shape, bool), None, None)
 
 
 def test_the_filter_in_double_precision_is_the_same_filter(sharpener: Sharpener, light: SceneLight) -> None:
