@@ -90,6 +90,14 @@ def test_dark_frames_with_the_exposure_times_of_others_are_refused(order: tuple[
     assert noted(result, "does not rise with exposure")
 
 
+def test_dark_current_that_grows_while_a_sensor_warms_is_no_wrong_exposure_time() -> None:
+    data = captured(SENSOR, 3)
+    warm = captured(replace(SENSOR, dark_e_per_s=1.2 * SENSOR.dark_e_per_s), 3)
+    last = [n for n, of in enumerate(data.levels) if len(of.dark)][-1]
+    levels = [*data.levels[:last], warm.levels[last], *data.levels[last + 1 :]]
+    assert fit_noise(replace(data, levels=levels)).status is FitStatus.CONVERGED
+
+
 def test_pixels_one_code_off_in_some_frames_are_not_hot() -> None:
     """Of noise of 0.2 code, most pixels have one code in all frames: 10 % of the others were listed as hot."""
     quiet = replace(SENSOR, bits=8, K_DN_per_e=0.02, black_DN=8.0, read_e=10.0, DSNU_e=0.0, dark_e_per_s=0.0)

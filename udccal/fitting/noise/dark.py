@@ -226,7 +226,10 @@ def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
         return float(np.sum((left - np.average(left, weights=1.0 / variances)) ** 2 / variances))
 
     by_time = off(max(dark.dark_DN_per_s.value, 0.0) * times)
-    return bool(chi2.sf(by_time, len(times) - 1) < data.rules.contradictory and off(means) < 0.1 * by_time)
+    # A sensor that warms by a degree or two changes its dark current by a fraction.
+    most = 0.25 * off(np.zeros(len(times)))
+    beyond = chi2.sf(by_time, len(times) - 1) < data.rules.contradictory
+    return bool(beyond and by_time > most and off(means) < 0.1 * by_time)
 
 
 def _temporal(data: NoiseMoments, most_hits: float, of_all: bool) -> tuple[PerPair, PerPair]:
