@@ -11,9 +11,8 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float
 
-from udccal.arguments import check_kind
 from udccal.effort import FitEffort
-from udccal.errors import SessionError, UdccalError
+from udccal.errors import UdccalError
 from udccal.fitting.geometry.data import BoardView
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
@@ -27,7 +26,7 @@ from udccal.result import FitResult, TermResults
 from udccal.rig import RigDescription
 from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
-from udccal.sessions.store import Session
+from udccal.sessions.store import Session, check_session
 from udccal.term_fits import FitTime, TermFits
 
 ORDER: tuple[TermName, ...] = get_args(TermName)
@@ -135,7 +134,7 @@ def fit(session: Session, term: str, effort: FitEffort | None = None) -> FitResu
         SessionError: when it is no session, or a file of it is missing or damaged.
         UdccalError: when ``term`` is not the name of a term.
     """
-    _check_session(session)
+    check_session(session)
     if term not in ORDER:
         raise UdccalError(f"Expected a term, one of {', '.join(ORDER)}, found '{term}'. Name one of these.")
     return getattr(TermFits(session, effort), term)
@@ -176,7 +175,7 @@ def calibrate(
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
-    _check_session(session)
+    check_session(session)
     effort = effort or FitEffort()
     base = foundation or fit_foundation(session, progress, effort)
     fits = TermFits(session, effort, progress)
@@ -186,7 +185,3 @@ def calibrate(
         late = [pool.submit(getattr, fits, term) for term in ("psf", "backscatter")]
     times = sorted(fits.times, key=lambda taken: ORDER.index(taken.term))
     return Calibration(session, base, late[0].result(), late[1].result(), (*base.times, *times))
-
-
-def _check_session(session: object) -> None:
-    check_kind(session, Session, "Open a folder by udccal.Session.open(path).", SessionError)

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from udccal.arguments import check_kind
 from udccal.errors import ProfileError, SessionError
 from udccal.profiles.profile import Profile
+from udccal.profiles.store import check_profile
 from udccal.rig import RigDescription
 from udccal.sessions.schema import StoredCamera
 from udccal.sessions.store import Session
@@ -22,7 +22,7 @@ def check_comparable(a: Profile, b: Profile) -> None:
         ProfileError: when rig, panel, sensor or camera differ; the message names the first difference.
     """
     for profile in (a, b):
-        check_kind(profile, Profile, "Read a folder by udccal.load_profile(path).", ProfileError)
+        check_profile(profile)
     if (found := _difference(a.rig, a.provenance.camera, b.rig, b.provenance.camera)) is not None:
         what, first, second = found
         raise ProfileError(

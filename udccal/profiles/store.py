@@ -99,6 +99,15 @@ def _read(path: Path) -> Profile:
         return decode(read_stored(folder), folder)
 
 
+def check_profile(value: object) -> None:
+    """Refuse what is no profile, such as its path.
+
+    Raises:
+        ProfileError: which says how to read one.
+    """
+    check_kind(value, Profile, "Read a folder by udccal.load_profile(path).", ProfileError)
+
+
 def load_profile(name_or_path: str | Path) -> Profile:
     """Read a profile.
 

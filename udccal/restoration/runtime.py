@@ -14,15 +14,14 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
-from udccal.arguments import check_kind
 from udccal.cfa import cfa_named
-from udccal.errors import ProfileError, RestorationError
+from udccal.errors import RestorationError
 from udccal.kernels import fitted_size
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
-from udccal.profiles.store import load_profile
+from udccal.profiles.store import check_profile, load_profile
 from udccal.restoration.backscatter import PanelLight, refuse_excess
 from udccal.restoration.blind import BlindSamples
 from udccal.restoration.checks import check_exposure, check_frame, check_panel_picture
@@ -145,7 +144,7 @@ class Restorer:
             RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
                 finite, there is no such tier, or options are no ``PlanOptions``.
         """
-        check_kind(profile, Profile, "Read a folder by udccal.load_profile(path).", ProfileError)
+        check_profile(profile)
         options, tier, keep = checked_options(options), tier_named(tier), None if keep is None else Path(keep)
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)

@@ -10,7 +10,7 @@ from typing import TypeVar, final
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from udccal.arguments import check_is_path
+from udccal.arguments import check_is_path, check_kind
 from udccal.errors import FileFormatError, MissingStepError, SessionError
 from udccal.io.exr import read_exr
 from udccal.io.hashing import sha256_file
@@ -161,3 +161,12 @@ def _checksum(file: Path) -> str:
             return sha256_file(file)
     except FileFormatError as error:  # too large
         raise SessionError(str(error)) from error
+
+
+def check_session(value: object) -> None:
+    """Refuse what is no session, such as its path.
+
+    Raises:
+        SessionError: which says how to open one.
+    """
+    check_kind(value, Session, "Open a folder by udccal.Session.open(path).", SessionError)

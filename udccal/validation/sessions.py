@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import final
 
-from udccal.arguments import check_kind
 from udccal.comparison.comparable import check_sessions
 from udccal.comparison.estimates import ORDER
 from udccal.errors import MissingStepError, SessionError
 from udccal.io.hashing import sha256_file
 from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
-from udccal.sessions.store import Session
+from udccal.sessions.store import Session, check_session
 from udccal.validation.checks import Check, Judged, ZMap
 from udccal.validation.limits import ValidationLimits
 from udccal.validation.pairs import compare_flats, compare_noise, compare_panel
@@ -62,7 +61,7 @@ def compare_sessions(session: Session, against: Session, limits: ValidationLimit
         FitError: when frames are not what a fit takes.
     """
     for one in (session, against):
-        check_kind(one, Session, "Open a folder by udccal.Session.open(path).", SessionError)
+        check_session(one)
     return compared(session, against, limits or ValidationLimits())[0]
 
 

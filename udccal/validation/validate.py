@@ -7,16 +7,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import final
 
-from udccal.arguments import check_kind
 from udccal.comparison.comparable import check_same_rig
 from udccal.comparison.estimates import ORDER
-from udccal.errors import MissingStepError, ProfileError, SessionError
+from udccal.errors import MissingStepError, SessionError
 from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile
+from udccal.profiles.store import check_profile
 from udccal.result import FitStatus
 from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
-from udccal.sessions.store import Session
+from udccal.sessions.store import Session, check_session
 from udccal.validation.backscatter import validate_backscatter
 from udccal.validation.checks import Check, Judged, ZMap
 from udccal.validation.geometry import validate_geometry
@@ -77,8 +77,8 @@ def validate(profile: Profile, session: Session, limits: ValidationLimits | None
         SessionError: when a file of the session is missing or damaged, or no term can be judged.
         FitError: when frames or boards are not what a fit takes.
     """
-    check_kind(profile, Profile, "Read a folder by udccal.load_profile(path).", ProfileError)
-    check_kind(session, Session, "Open a folder by udccal.Session.open(path).", SessionError)
+    check_profile(profile)
+    check_session(session)
     return judge(profile, session, limits or ValidationLimits())[0]
 
 

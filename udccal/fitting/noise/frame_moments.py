@@ -178,14 +178,14 @@ class _Sums:
         self, exposure_s: float, light: float | None, rows: Float[np.ndarray, "frames rows"], mean_DN: Picture
     ) -> Moments:
         """The moments; ``rows`` and ``mean_DN`` as from ``mean``."""
-        (number, height), counts = rows.shape, self._counts
-        variance, dof = self._variance(number)
+        (number, height), counts, left = rows.shape, self._counts, np.stack(self._by_bin)
+        left -= left.mean(axis=0)
+        variance, dof = self._variance(left)
         middle = float(np.median(self.first[:: max(height // 64, 1)]))
         about = cv2.subtract(mean_DN, middle)
         level = self._binned(about) / counts
         spatial = np.maximum(self._binned(cv2.multiply(about, about)) / counts - level**2, 0.0)
-        peak, left = max(code for code, _ in self._peaks), np.stack(self._by_bin)
-        rows, left = rows - rows.mean(axis=0), left - left.mean(axis=0)
+        peak, rows = max(code for code, _ in self._peaks), rows - rows.mean(axis=0)
         shift = (left + (rows @ self._down.T)[..., None] * self._width) / counts
         of_rows = float(np.square(rows - rows.mean(axis=1, keepdims=True)).sum())
         return Moments(
@@ -223,12 +223,12 @@ class _Sums:
             difference[hits] = 0.0
         return difference
 
-    def _variance(self, number: int) -> tuple[Grid, Grid]:
-        """Temporal variance of one frame, and its degrees of freedom."""
-        columns, left = self.first.shape[1], np.stack(self._by_bin)
+    def _variance(self, left: Float[np.ndarray, "frames groups_y groups_x"]) -> tuple[Grid, Grid]:
+        """Temporal variance of one frame, and its degrees of freedom; ``left`` are the bins' sums less their mean."""
+        number, columns = len(left), self.first.shape[1]
         dof = np.maximum((number - 1) * (self._counts * (1 - 1 / columns) - 1), 1.0)
         squares = self._squares - self._binned(cv2.multiply(self._total, self._total, scale=1.0 / number))
-        squares -= np.square(left - left.mean(axis=0)).sum(axis=0) / self._counts
+        squares -= np.square(left).sum(axis=0) / self._counts
         # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
         # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
         mixed = squares / dof

@@ -57,7 +57,9 @@ class _Stages(eqx.Module):
         with jax.default_matmul_precision("highest"):
             signal, variance, clipped, panel, levels, excess = self.front.light(raw, exposed, known, rate)
             inner = self.tiles.layout.inner
-            sharp = self.front.put_back(self._sharp(signal, variance, clipped), levels, inner.start, exposed)
+            sharp = self._sharp(signal, variance, clipped)
+            of_unknown = sharp, levels, inner.start, exposed
+            sharp = jax.lax.cond(known, lambda: sharp, lambda: self.front.put_back(*of_unknown))
             if self.error > 0:
                 sharp = plausible(sharp, self.error * panel[inner])
             # The table of ``Tone.rgb8``.
