@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from udccal.arguments import Numbers, check_array, check_count, check_number
+from udccal.arguments import Numbers, check_array, check_count, check_number, number_of
 from udccal.errors import FitError
 
 
@@ -45,3 +45,11 @@ def test_arrays_of_another_kind_or_shape_are_refused(value: object, numbers: Num
 def test_an_axis_with_a_name_has_any_length() -> None:
     for rows in (0, 5):
         check_array(np.zeros((rows, 3), np.uint8), "it", "8-bit values", ("rows", 3), "Give it.", FitError)
+
+
+def test_the_number_in_an_array_of_no_axes_is_a_number() -> None:
+    """Terms hold their numbers so: noise.PRNU1288 may be given on."""
+    check_number(number_of(np.array(0.5)), "a part", (0.0, 1.0), "Give one.", FitError)
+    for value in (None, "0.5", np.array(True), np.array([0.5]), [0.5]):
+        with pytest.raises(FitError, match="Expected a part from 0 to 1"):
+            check_number(number_of(value), "a part", (0.0, 1.0), "Give one.", FitError)

@@ -26,6 +26,11 @@ def found_instead(value: object) -> str:
     return type(value).__name__ if kind is None else f"{kind} of shape {shape}"
 
 
+def number_of(value: object) -> object:
+    """The number that a 0-d array holds, as terms have them; anything else as it is."""
+    return np.asarray(value)[()] if getattr(value, "ndim", None) == 0 else value
+
+
 def check_kind(value: object, kind: type, advice: str, error: type[UdccalError]) -> None:
     """Refuse what is no object of a class.
 
@@ -97,13 +102,16 @@ def check_array(
     Raises:
         UdccalError: of that kind, with kind and shape of the array.
     """
-    fits = isinstance(value, np.ndarray) and value.dtype.kind in _KINDS[numbers] and value.ndim == len(shape)
-    if isinstance(value, np.ndarray) and fits:
-        fits = all(isinstance(n, str) or n == found for n, found in zip(shape, value.shape, strict=True))
-        fits = fits and (numbers != "8-bit values" or value.itemsize == 1)
-    if not fits:
+    if not (isinstance(value, np.ndarray) and _holds(value, numbers, shape)):
         expected = f"Expected {what} as an array of {numbers}, {' x '.join(map(str, shape))}"
         raise error(f"{expected}, found {found_instead(value)}. {advice}")
+
+
+def _holds(array: np.ndarray, numbers: Numbers, shape: tuple[int | str, ...]) -> bool:
+    if array.dtype.kind not in _KINDS[numbers] or array.ndim != len(shape):
+        return False
+    sides = all(isinstance(n, str) or n == found for n, found in zip(shape, array.shape, strict=True))
+    return sides and (numbers != "8-bit values" or array.itemsize == 1)
 
 
 def _shown(value: object) -> str:

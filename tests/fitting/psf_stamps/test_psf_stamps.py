@@ -285,6 +285,10 @@ def test_bad_stamps_are_refused(change: dict, words: str) -> None:
         checked_with(make(1)[0], change)
 
 
+def test_numbers_may_be_arrays_of_no_axes() -> None:
+    checked_with(make(1)[0], {"read_e": np.array(4.0), "clip_e": np.array(np.inf)})
+
+
 @pytest.mark.parametrize("value_e", [np.nan, 0.0, -100.0])
 def test_stamps_without_light_are_refused(value_e: float) -> None:
     stamps, _ = make(1)

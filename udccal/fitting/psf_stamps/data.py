@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.arguments import check_array, check_number
+from udccal.arguments import check_array, check_number, number_of
 from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import robust_sigma
@@ -51,9 +51,9 @@ class Stamps:
             span = f"{self.position_px.min():g} to {self.position_px.max():g}"
             raise FitError(f"Expected positions on the sensor of at most {_FARTHEST_PX} px, found {span}. {advice}")
         bounds, advice = (1e-6, 1e9), "Count the quantisation into it."
-        check_number(self.read_e, "a read noise in e-", bounds, advice, FitError)
+        check_number(number_of(self.read_e), "a read noise in e-", bounds, advice, FitError)
         advice = "Leave it out if nothing clips."
-        check_number(self.clip_e, "a clipping level in e-", (1e-6, np.inf), advice, FitError)
+        check_number(number_of(self.clip_e), "a clipping level in e-", (1e-6, np.inf), advice, FitError)
         self._check_different()
         if self.channel is None:
             return

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
 
-from udccal.arguments import check_array, check_number
+from udccal.arguments import check_array, check_number, number_of
 from udccal.cfa import PATTERNS, cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import OutlierRule
@@ -74,7 +74,7 @@ class WireData:
         if self.variance.size and not (np.isfinite(self.variance) & (self.variance >= 0)).any():
             raise FitError("Expected variances of 0 or more, found none. Take them from the frames that were averaged.")
         for name, number in (("PRNU1288", self.PRNU1288), ("part of clipped pixels", self.clipped)):
-            check_number(number, f"a {name}", (0.0, 1.0), "Take it from the noise fit.", FitError)
+            check_number(number_of(number), f"a {name}", (0.0, 1.0), "Take it from the noise fit.", FitError)
         if np.isnan(self.clip):
             raise FitError("Expected a signal from which frames clip, found NaN. Leave it out if nothing clips.")
         if self.cfa not in PATTERNS:
