@@ -1,54 +1,30 @@
 /* Counts the frames of `udccal run --sink shm:NAME`; docs/live.md has the layout. cc -O2 -o read_live read_live.c */
-#include <fcntl.h>
-#include <stdint.h>
+#include <err.h>
+#include <inttypes.h>
 #include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 #include <sys/file.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
-
-struct header { /* constant but for the last two */
-    char magic[8];
-    uint32_t version, header_bytes, width, height, stride, format, slots, edge_bytes;
-    uint64_t slot_bytes, first_slot, newest, closed;
-};
-
-static uint64_t word(const void *place) { return __atomic_load_n((const uint64_t *)place, __ATOMIC_ACQUIRE); }
-
-static int failed(const char *why) { return fprintf(stderr, "%s\n", why), 1; }
+#define WORD(byte) __atomic_load_n((const uint64_t *)(memory + (byte)), __ATOMIC_ACQUIRE)
 
 int main(int count, char **words) {
-    char path[128];
     struct stat size;
-    snprintf(path, sizeof path, "/%s", count > 1 ? words[1] : "");
-    int file = shm_open(path, O_RDONLY, 0);
-    if (file < 0 || fstat(file, &size) != 0) return perror("shm_open"), 1;
+    int file = shm_open(count > 1 ? words[1] : "", O_RDONLY, 0);
+    if (file < 0 || fstat(file, &size) != 0) err(1, "shm_open");
     const char *memory = mmap(NULL, size.st_size, PROT_READ, MAP_SHARED, file, 0);
-    const struct header *header = (const struct header *)memory;
-    if (memory == MAP_FAILED || memcmp(header->magic, "UDCCALFR", 8) != 0 || header->version != 1)
-        return failed("expected frames of udccal, version 1, found something else");
-    size_t bytes = (size_t)header->stride * header->height;
-    unsigned char *picture = malloc(bytes);
-    for (uint64_t seen = 0, newest; !word(&header->closed); seen = newest) {
-        if ((newest = word(&header->newest)) == seen) { /* the writer locks the memory for as long as it lives */
-            if (flock(file, LOCK_SH | LOCK_NB) == 0 && !word(&header->closed))
-                return failed("expected the writer to live, found that it was killed; start it again");
-            usleep(1000);
-            continue;
-        }
-        const char *slot = memory + header->first_slot + (newest - 1) % header->slots * header->slot_bytes;
-        uint64_t last = word(slot + header->slot_bytes - header->edge_bytes); /* first of all */
-        memcpy(picture, slot + header->edge_bytes, bytes);
-        uint64_t sum = 0, frame_id = word(slot + 8);
-        __atomic_thread_fence(__ATOMIC_ACQUIRE);
-        int whole = last == newest && word(slot) == newest; /* last of all */
-        for (size_t i = 0; i < bytes; i++) sum += picture[i];
-        printf("frame %llu: ", (unsigned long long)frame_id);
-        if (whole) printf("mean %.2f\n", (double)sum / bytes);
-        else printf("torn\n");
+    const uint32_t *header = (const uint32_t *)memory; /* [5] rows, [6] stride, [8] slots, [9] bytes of a slot's edge */
+    if (memory == MAP_FAILED || memcmp(memory, "UDCCALFR\1\0\0", 12)) errx(1, "expected udccal's frames, version 1");
+    for (uint64_t seen = 0, newest, sum, bytes = (uint64_t)header[5] * header[6]; !WORD(64); seen = newest) {
+        while ((newest = WORD(56)) == seen && !WORD(64) && usleep(1000) == 0) /* the writer holds a lock till it ends */
+            if (!flock(file, LOCK_SH | LOCK_NB) && !WORD(64)) errx(1, "expected a writer, found that it was killed");
+        if (newest == seen) break;
+        uint64_t slot = WORD(48) + (newest - 1) % header[8] * WORD(40), last = WORD(slot + WORD(40) - header[9]);
+        printf("frame %" PRIu64 ": ", WORD(slot + 8));
+        for (uint64_t i = sum = 0; i < bytes; i++) sum += (unsigned char)memory[slot + header[9] + i];
+        __atomic_thread_fence(__ATOMIC_ACQUIRE); /* the slot's end is read first, its beginning last */
+        printf(last == newest && WORD(slot) == newest ? "mean %.2f\n" : "torn\n", (double)sum / bytes);
         fflush(stdout);
     }
-    return 0;
 }
