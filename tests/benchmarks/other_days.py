@@ -28,8 +28,9 @@ from tests.benchmarks.scenes import shared_scenes
 from udccal.benches.bench import simulated_bench
 from udccal.benches.capture import capture
 from udccal.calibration import calibrate
-from udccal.comparison.diff import ProfileDiff, TermDiff, diff
+from udccal.comparison.diff import ProfileDiff, diff
 from udccal.comparison.movement import Moved
+from udccal.comparison.term_diff import TermDiff
 from udccal.compilation import keep_compilations
 from udccal.drift.check import check_rig, short_rig
 from udccal.drift.update import updated

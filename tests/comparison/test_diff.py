@@ -14,9 +14,9 @@ import udccal
 from tests.comparison.perturbed import moved, with_estimates, with_result
 from udccal.cli.output import plain
 from udccal.comparison.comparable import check_comparable
-from udccal.comparison.diff import VERDICTS, verdict_of
 from udccal.comparison.effects import Effect
 from udccal.comparison.limits import DiffLimits
+from udccal.comparison.term_diff import VERDICTS, verdict_of
 from udccal.errors import ProfileError
 from udccal.fitting.wire.fit import sensor_map
 from udccal.profiles.profile import Profile, build_profile

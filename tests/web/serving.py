@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from tests.web.capture import SAMPLING, PlayedCapture
+from udccal.web.page import serve
 from udccal.web.person import WebPerson
-from udccal.web.server import serve
 
 
 @dataclass(frozen=True)

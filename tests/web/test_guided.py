@@ -19,9 +19,9 @@ from udccal.guide.events import DoneEvent
 from udccal.guide.steps import GuidedStep
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
+from udccal.web.page import serve
 from udccal.web.person import WebPerson
 from udccal.web.picture import Sampling
-from udccal.web.server import serve
 
 # What a person does wrong at first, and what the page then says.
 MISTAKES: Final[dict[str, tuple[Arrangement, str]]] = {

@@ -11,8 +11,9 @@ import pytest
 from tests.web.serving import Served
 from udccal.errors import UdccalError
 from udccal.web import requests as requests_module
+from udccal.web.page import serve
 from udccal.web.requests import MOST_BODY
-from udccal.web.server import MOST_CONNECTIONS, serve
+from udccal.web.server import MOST_CONNECTIONS
 
 MINE, OTHER = "a" * 32, "b" * 32
 

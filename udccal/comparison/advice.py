@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from udccal.comparison.effects import Effect
 from udccal.comparison.movement import Moved, Movement
-
-if TYPE_CHECKING:
-    from udccal.comparison.diff import TermDiff
+from udccal.comparison.term_diff import TermDiff
 
 
 def advice(terms: Sequence[TermDiff], moved: Movement, newer: str, lacking: Sequence[str], chance: float) -> str:

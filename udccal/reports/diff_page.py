@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from udccal.comparison.diff import ProfileDiff, TermDiff, Verdict
+from udccal.comparison.diff import ProfileDiff
 from udccal.comparison.maps import DifferenceMaps
+from udccal.comparison.term_diff import TermDiff, Verdict
 from udccal.reports.diff_figures import rays_figure, wire_difference_figure
 from udccal.reports.diff_tables import (
     effects_table,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from udccal.comparison.diff import ProfileDiff, TermDiff
+from udccal.comparison.diff import ProfileDiff
 from udccal.comparison.movement import Moved, Movement
+from udccal.comparison.term_diff import TermDiff
 from udccal.quantities import quantity
 from udccal.reports.tables import Table, number, spread
 

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, final
+from typing import Final, final
 from urllib.parse import parse_qsl
 
 from udccal.web.messages import AskedNews, PostedAnswer, news_json
 from udccal.web.person import Reception
-
-if TYPE_CHECKING:
-    from udccal.web.server import PageServer
+from udccal.web.server import PageServer
 
 # A request has to be whole, and its response taken, within so long; browsers on the same computer need milliseconds.
 PATIENCE_S: Final = 5.0

@@ -1,4 +1,4 @@
-"""The page's server: one page on this computer alone, for whoever has the address that holds its token."""
+"""The server of a page on this computer alone, for whoever has the address that holds its token."""
 
 from __future__ import annotations
 
@@ -7,20 +7,13 @@ import socket
 import socketserver
 import sys
 import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final, final
 
-from udccal.errors import UdccalError
 from udccal.web.person import WebPerson
-from udccal.web.requests import PageHandler
 
 HOST: Final = "127.0.0.1"
 MOST_CONNECTIONS: Final = 48
-# How long the last state stays to be fetched: a window that was drawing asks again within a fraction of it.
-_FAREWELL_S = 1.0
 
 
 @final
@@ -30,16 +23,17 @@ class PageServer(ThreadingHTTPServer):
     Args:
         person: whom the page shows.
         port: to listen on; 0 for any that is free.
+        handler: answers a request.
     """
 
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS
 
-    def __init__(self, person: WebPerson, port: int) -> None:
+    def __init__(self, person: WebPerson, port: int, handler: type[BaseHTTPRequestHandler]) -> None:
         self.person = person
         self.token = secrets.token_urlsafe(24)
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        super().__init__((HOST, port), PageHandler)
+        super().__init__((HOST, port), handler)
 
     @property
     def address(self) -> str:
@@ -75,32 +69,3 @@ class PageServer(ThreadingHTTPServer):
         """Say nothing of connections that broke or were too slow; print the traceback of anything else."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
-
-
-@contextmanager
-def serve(person: WebPerson, port: int) -> Iterator[str]:
-    """Serve the page of a person while the context lasts; yield its address.
-
-    Args:
-        person: whom the page shows.
-        port: to listen on; 0 for any that is free.
-
-    Raises:
-        UdccalError: when the port cannot be had.
-    """
-    try:
-        server = PageServer(person, port)
-    except OSError as error:
-        raise UdccalError(
-            f"Expected port {port} of this computer to be free, found: {error}. Choose another, or 0 for any."
-        ) from error
-    with server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.1,), name="page", daemon=True)
-        thread.start()
-        try:
-            yield server.address
-            if person.watched:
-                time.sleep(_FAREWELL_S)
-        finally:
-            server.shutdown()
-            thread.join()

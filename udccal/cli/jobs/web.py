@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from udccal.cli.output import Output
 from udccal.guide.events import Person
 from udccal.rig import RigDescription
+from udccal.web.page import serve
 from udccal.web.person import WebPerson
 from udccal.web.picture import Sampling
-from udccal.web.server import serve
 
 
 @contextmanager
