@@ -27,8 +27,8 @@ from udccal.fitting.geometry.bundle import (
     Bundle,
     BundleProblem,
     GeometryRules,
-    Intrinsics,
     Points,
+    intrinsics_of,
     projected,
 )
 from udccal.fitting.geometry.data import best_poses, gather, rig_prior
@@ -70,7 +70,7 @@ class BoardViews:
 
     def __init__(self, state: RigState) -> None:
         self._state, self._field = state, EvenField(state)
-        self.intrinsics = Intrinsics.of_geometry(state.geometry).vector
+        self.intrinsics = intrinsics_of(state.geometry)
 
     def planned(self, step: PlannedStep, board: Board) -> BoardView | None:
         """Return the view of a board in the light of a step; None where it shows too few corners to hold its pose."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.board.charuco import board_points_mm
-from udccal.fitting.geometry.bundle import Intrinsics
+from udccal.fitting.geometry.bundle import camera_matrix, intrinsics_of
 from udccal.fitting.geometry.data import BoardView
 from udccal.models.geometry import Geometry
 
@@ -35,9 +35,9 @@ def board_evidence(boards: Sequence[BoardView], geometry: Geometry) -> BoardEvid
 
 def _residuals(view: BoardView, geometry: Geometry) -> Float[np.ndarray, "n 2"]:
     """Return found minus projected corners in px, with the pose that fits this view best."""
-    lens = Intrinsics.of_geometry(geometry)
-    distortion = np.asarray(lens.distortion, dtype=np.float64)
+    intrinsics = intrinsics_of(geometry)
+    lens = camera_matrix(intrinsics), intrinsics[4:]
     points_mm = board_points_mm(view.spec)[view.corners.ids]
-    _, rotation, translation = cv2.solvePnP(points_mm, view.corners.xy, lens.matrix, distortion)
-    projected, _ = cv2.projectPoints(points_mm, rotation, translation, lens.matrix, distortion)
+    _, rotation, translation = cv2.solvePnP(points_mm, view.corners.xy, *lens)
+    projected, _ = cv2.projectPoints(points_mm, rotation, translation, *lens)
     return view.corners.xy - projected.reshape(-1, 2)

@@ -16,9 +16,9 @@ from udccal.fitting.geometry.bundle import (
     LENS,
     Bundle,
     GeometryRules,
-    Intrinsics,
     Points,
     in_sigma,
+    intrinsics_of,
     linearised,
     solve,
 )
@@ -53,7 +53,7 @@ def judge_geometry(
     views = [view for view in views if view.usable(rules)]
     if not views:
         return unusable("geometry", "No board shows enough corners. Capture the boards again, evenly lit and sharp.")
-    lens = Intrinsics.of_geometry(result.term).vector
+    lens = intrinsics_of(result.term)
     given = _points(views, result, rules)
     if not given.names:
         return unusable("geometry", "No board holds a pose. Capture boards that show two rows of corners or more.")

@@ -24,6 +24,7 @@ from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge
 from udccal.fitting.geometry.data import gather
 from udccal.fitting.geometry.views import calibrate_views
 from udccal.models.geometry import Geometry
+from udccal.result import FitStatus
 
 Boards = tuple[list[np.ndarray], list[np.ndarray]]
 # Starts: focal lengths wrong by up to this factor either way, the centre by this part of the width.
@@ -53,7 +54,7 @@ def same(found: CalibratedViews, reference: CalibratedViews) -> bool:
     """Whether two calibrations are one minimum: within a hundredth of a sigma in everything."""
     sigma = np.sqrt(np.diag(reference.cov))[:9]
     told = sigma > 0
-    off = np.abs(found.intrinsics.vector - reference.intrinsics.vector)
+    off = np.abs(found.intrinsics - reference.intrinsics)
     return found.free == reference.free and bool((off[told] < 0.01 * sigma[told]).all())
 
 
@@ -64,7 +65,7 @@ def converged(works: ModuleType, data: list[Boards], references: list[Calibrated
         board, image = data[k % len(data)]
         start, poses = random_start(works, len(board), rng)
         found = calibrate_views(gather(board, image), (works.W, works.H), start, start_poses=poses)
-        count += found.converged and same(found, references[k % len(data)])
+        count += found.status is FitStatus.CONVERGED and same(found, references[k % len(data)])
     return count
 
 
@@ -84,7 +85,7 @@ def aligned(works: ModuleType, intrinsics: np.ndarray) -> np.ndarray:
 def z_scores(works: ModuleType, result: CalibratedViews) -> np.ndarray:
     """Errors after the best common rotation in units of their sigma, (81, 2)."""
     cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
-    return aligned(works, result.intrinsics.vector) / np.sqrt(np.einsum("nii->ni", cov))
+    return aligned(works, result.intrinsics) / np.sqrt(np.einsum("nii->ni", cov))
 
 
 def spread(works: ModuleType, seeds: int) -> tuple[float, float]:
@@ -120,7 +121,7 @@ def main() -> None:
         seconds.append(taken)
         cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
         sigmas.append(np.sqrt(np.einsum("nii->ni", cov)))
-    metrics = [works.intrinsics_metrics(result.intrinsics.vector) for result in results]
+    metrics = [works.intrinsics_metrics(result.intrinsics) for result in results]
     pooled = {key: float(np.sqrt(np.mean([m[key] ** 2 for m in metrics]))) for key in metrics[0]}
     z_std, z_std_error = spread(works, options.covered)
     found = converged(works, data, results, options.starts) if options.starts else None
@@ -131,7 +132,7 @@ def main() -> None:
         float(np.median(seconds)),
         first_run_s=first,
         seeds=options.seeds,
-        converged=sum(result.converged for result in results),
+        converged=sum(result.status is FitStatus.CONVERGED for result in results),
         orders=[next(c.name for c in result.candidates if c.chosen) for result in results],
         reproj_rms=[result.rms_px for result in results],
         predicted_rms=float(np.sqrt((np.square(sigmas).sum(axis=2)).mean())),

@@ -95,49 +95,25 @@ class GeometryRules:
 USUAL = GeometryRules()
 
 
-@final
-@dataclass(frozen=True)
-class Intrinsics:
-    """The nine numbers of a lens, or a number for each of them (a sigma, a row of a matrix); see ``Geometry``.
+def intrinsics_of(geometry: Geometry) -> Float[np.ndarray, "9"]:
+    """Intrinsics of a fitted or nominal term as a vector, in the order of ``INTRINSIC_NAMES``."""
+    return np.concatenate([geometry.focal_px, geometry.principal_point_px, geometry.distortion], dtype=np.float64)
 
-    ``of`` and ``vector`` convert from and to a vector in the order of ``INTRINSIC_NAMES``.
-    """
 
-    focal_px: Float[Arrayish, "2 ..."]
-    principal_point_px: Float[Arrayish, "2 ..."]
-    distortion: Float[Arrayish, "5 ..."]
+def centred(focal_px: float, image_size: tuple[int, int]) -> Float[np.ndarray, "9"]:
+    """Intrinsics without distortion, about the middle of the picture of (columns, rows)."""
+    return np.concatenate([np.full(2, focal_px), (np.array(image_size) - 1) / 2, np.zeros(5)])
 
-    @classmethod
-    def of(cls, vector: Float[Arrayish, "n ..."]) -> Intrinsics:
-        """From a vector, or a matrix whose first rows are the intrinsics; numpy or JAX arrays."""
-        return cls(vector[:2], vector[2:4], vector[4:LENS])
 
-    @classmethod
-    def of_geometry(cls, geometry: Geometry) -> Intrinsics:
-        """Of a fitted or nominal term."""
-        return cls(geometry.focal_px, geometry.principal_point_px, geometry.distortion)
+def lens_alone(intrinsics: Float[Arrayish, " n"]) -> Geometry:
+    """The term of a vector that begins with intrinsics (numpy or JAX): camera coordinates are the panel's."""
+    return Geometry(intrinsics[:2], intrinsics[2:4], intrinsics[4:LENS], np.zeros(3), np.zeros(3))
 
-    @classmethod
-    def centred(cls, focal_px: float, image_size: tuple[int, int]) -> Intrinsics:
-        """Without distortion, about the middle of the picture of (columns, rows)."""
-        return cls(np.full(2, focal_px), (np.array(image_size) - 1) / 2, np.zeros(5))
 
-    @property
-    def vector(self) -> Float[np.ndarray, "9"]:
-        """In double precision."""
-        return np.concatenate(
-            [np.asarray(p, dtype=np.float64) for p in (self.focal_px, self.principal_point_px, self.distortion)]
-        )
-
-    @property
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """OpenCV's camera matrix."""
-        (fx, fy), (cx, cy) = np.asarray(self.focal_px), np.asarray(self.principal_point_px)
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-    def camera(self) -> Geometry:
-        """The term with the lens alone: camera coordinates are the panel's."""
-        return Geometry(self.focal_px, self.principal_point_px, self.distortion, np.zeros(3), np.zeros(3))
+def camera_matrix(intrinsics: Float[np.ndarray, "9"]) -> Float[np.ndarray, "3 3"]:
+    """OpenCV's camera matrix."""
+    fx, fy, cx, cy = intrinsics[:4]
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 @final
@@ -199,8 +175,8 @@ def projected(
 
     The second result has their derivatives by the 9 intrinsics, a small turn (rad) and a shift of the points.
     """
-    lens = Intrinsics.of(intrinsics)
-    places, slopes = cv2.projectPoints(camera, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)
+    lens = camera_matrix(intrinsics), intrinsics[4:]
+    places, slopes = cv2.projectPoints(camera, np.zeros(3), np.zeros(3), *lens)
     by = slopes.reshape(-1, 2, 15)
     return places.reshape(-1, 2), np.concatenate([by[..., 6:], by[..., :6]], axis=2)
 

@@ -23,9 +23,9 @@ from udccal.fitting.geometry.bundle import (
     LENS,
     BundleProblem,
     GeometryRules,
-    Intrinsics,
     Points,
     Solved,
+    camera_matrix,
     in_sigma,
     projected,
 )
@@ -63,7 +63,7 @@ class CalibratedViews:
     """Intrinsics and poses with their uncertainty, and the evidence for them.
 
     Attributes:
-        intrinsics: the lens; distortion coefficients that the data do not ask for are 0, and not ``free``.
+        intrinsics: in the order of ``INTRINSIC_NAMES``; those that the data do not ask for are 0, and not ``free``.
         poses: of the views in use, board to camera: rotation vector (rad), then translation (board's unit).
         cov: of the intrinsics as a vector, then 6 per view in use. The scale of the noise is estimated; where the views
             disagree beyond it, the variance of their disagreement is added.
@@ -73,10 +73,9 @@ class CalibratedViews:
         candidates: the orders of the distortion, by BIC.
         status: ``CONVERGED``, or the reason not to use this; ``notes`` say what to do.
         iterations: of the last solve with all distortions free.
-        image_size: (columns, rows).
     """
 
-    intrinsics: Intrinsics
+    intrinsics: Float[np.ndarray, "9"]
     poses: Float[np.ndarray, "views 6"]
     cov: Float[np.ndarray, "n n"]
     points: Points
@@ -90,11 +89,6 @@ class CalibratedViews:
     outliers: tuple[Outliers, ...]
     iterations: int
     image_size: tuple[int, int]
-
-    @property
-    def converged(self) -> bool:
-        """Whether this can be used."""
-        return self.status is FitStatus.CONVERGED
 
     @property
     def rms_px(self) -> float:
@@ -130,9 +124,12 @@ class CalibratedViews:
         self, pixels: Float[np.ndarray, "rays 2"]
     ) -> tuple[Float[np.ndarray, "rays 2 9"], Float[np.ndarray, "rays 2 3"]]:
         """Derivatives of the places where rays land, by the intrinsics and by a small rotation of the rays."""
-        lens, enough = self.intrinsics, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-9)
-        ideal = cv2.undistortPoints(pixels, lens.matrix, lens.distortion, criteria=enough)
-        places, by = projected(lens.vector, cv2.convertPointsToHomogeneous(ideal).reshape(-1, 3))
+        lens, enough = (
+            (camera_matrix(self.intrinsics), self.intrinsics[4:]),
+            (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-9),
+        )
+        ideal = cv2.undistortPoints(pixels, *lens, criteria=enough)
+        places, by = projected(self.intrinsics, cv2.convertPointsToHomogeneous(ideal).reshape(-1, 3))
         near = np.abs(places - pixels).max(axis=1) < 1e-6
         lost = ~near | (np.linalg.det(np.where(near[:, None, None], by[:, :, LENS + 3 : LENS + 5], 0.0)) <= 0)
         if lost.any():
@@ -181,20 +178,15 @@ def weigh(
     unit = 1 / np.sqrt(np.maximum(np.einsum("kii->i", information[:, :, free]), 1e-300))
     units, among = np.outer(unit, unit), np.ix_(free, free)
     information, score = information[:, :, free] * units, score * unit
-    views, lens = _disagreement(information, score, dof), solved.equations.cov()
-    pattern, size = _pattern(solved, points, image_size, dof, cells)
-    if views.found:
-        lens[among] = clustered_cov(lens[among] / units, score, information) * units
-    return Evidence(pattern, views, size if pattern.found else 0.0), solved.equations.joint_cov(lens, views.inflation)
-
-
-def _disagreement(information: np.ndarray, score: np.ndarray, dof: float) -> MisfitTest:
-    """Cochran's Q: sum over views of score' information^+ score, the distances of the views' minima from the common."""
+    # Cochran's Q: sum over views of score' information^+ score, the distances of the views' minima from the common one.
     values, vectors = np.linalg.eigh(information)
     seen = values > 1e-9 * np.maximum(values[:, -1:], 1e-9)
     along = np.einsum("kij,ki->kj", vectors, score)
-    total = float((along[seen] ** 2 / values[seen]).sum())
-    return f_test(total, int(seen.sum()) - score.shape[1], dof)
+    views = f_test(float((along[seen] ** 2 / values[seen]).sum()), int(seen.sum()) - len(unit), dof)
+    lens, (pattern, size) = solved.equations.cov(), _pattern(solved, points, image_size, dof, cells)
+    if views.found:
+        lens[among] = clustered_cov(lens[among] / units, score, information) * units
+    return Evidence(pattern, views, size if pattern.found else 0.0), solved.equations.joint_cov(lens, views.inflation)
 
 
 def _pattern(

@@ -22,7 +22,7 @@ from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.geometry.bundle import USUAL, GeometryRules, Intrinsics, Points
+from udccal.fitting.geometry.bundle import USUAL, GeometryRules, Points, camera_matrix, intrinsics_of
 from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.wire.data import read_wire
@@ -61,7 +61,7 @@ class GeometryData:
     """The data of a rig's geometry fit: views of boards, at least one of them parallel to the panel.
 
     The fit starts at ``nominal``, whose pupil it keeps. ``image_size`` is (columns, rows). ``prior`` is on the
-    intrinsics, in the order of ``Intrinsics``; None where nothing is known.
+    intrinsics, in the order of ``INTRINSIC_NAMES``; None where nothing is known.
     """
 
     views: tuple[BoardView, ...]
@@ -102,7 +102,7 @@ def rig_prior(rig: RigDescription, rules: GeometryRules = USUAL) -> Prior:
     """
     focal = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
     sigma = [*[focal] * 2, *[rules.centre_sigma * rig.camera.columns] * 2, *rules.distortion_sigma]
-    return Prior.independent(Intrinsics.of_geometry(nominal_geometry(rig)).vector, np.array(sigma))
+    return Prior.independent(intrinsics_of(nominal_geometry(rig)), np.array(sigma))
 
 
 @final
@@ -231,31 +231,29 @@ def best_poses(
     points: Points, intrinsics: Float[np.ndarray, "9"]
 ) -> tuple[Float[np.ndarray, "views 6"], Float[np.ndarray, "views 6"]]:
     """The best pose of each view at these intrinsics, and the one mirrored at the line of sight."""
-    pairs = [_pose_pair(points, view, Intrinsics.of(intrinsics)) for view in range(len(points.names))]
-    return np.array([first for first, _ in pairs]), np.array([second for _, second in pairs])
+    lens = camera_matrix(intrinsics), intrinsics[4:]
+    pairs = np.array([_pose_pair(points, view, *lens) for view in range(len(points.names))]).reshape(-1, 2, 6)
+    return pairs[:, 0], pairs[:, 1]
 
 
-def _pose_pair(points: Points, view: int, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+def _pose_pair(points: Points, view: int, matrix: np.ndarray, distortion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     mine = (points.view == view) & points.used
     board, image = points.board[mine], points.image[mine]
-    good = _consistent(board, image)
-    flat = np.linalg.svd(board - board.mean(axis=0), compute_uv=False)
+    good, middle = _consistent(board, image), board.mean(axis=0)
+    flat = np.linalg.svd(board - middle, compute_uv=False)
     method = cv2.SOLVEPNP_IPPE if flat[2] <= 1e-6 * flat[0] else cv2.SOLVEPNP_SQPNP
     try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(board[good], image[good], lens.matrix, lens.distortion, flags=method)
+        _, turns, shifts, _ = cv2.solvePnPGeneric(board[good], image[good], matrix, distortion, flags=method)
     except cv2.error:
         turns, shifts = (), ()
     found = [np.concatenate([t.ravel(), s.ravel()]) for t, s in zip(turns, shifts, strict=True)]
-    found = [pose for pose in found if np.isfinite(pose).all()] or [_ahead(board, image, lens)]
+    found = [pose for pose in found if np.isfinite(pose).all()]
+    if not found:  # One that faces the camera, at the distance and place by the points' spread.
+        across, down = image.mean(axis=0)
+        seen = max(float(np.linalg.norm(image - [across, down])), 1e-9)
+        distance = matrix[0, 0] * float(np.linalg.norm(board - middle)) / seen
+        found = [np.append(np.zeros(3), np.linalg.solve(matrix, [across, down, 1.0]) * distance - middle)]
     return found[0], found[-1]
-
-
-def _ahead(board: np.ndarray, image: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    """A pose that faces the camera, at the distance and place by the points' spread."""
-    (across, down), middle = image.mean(axis=0), board.mean(axis=0)
-    seen = max(float(np.linalg.norm(image - image.mean(axis=0))), 1e-9)
-    distance = lens.matrix[0, 0] * float(np.linalg.norm(board - middle)) / seen
-    return np.concatenate([np.zeros(3), np.linalg.solve(lens.matrix, [across, down, 1.0]) * distance - middle])
 
 
 def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:

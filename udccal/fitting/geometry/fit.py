@@ -20,7 +20,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
-from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, USUAL, GeometryRules, Intrinsics
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, USUAL, GeometryRules, centred, lens_alone
 from udccal.fitting.geometry.calibrated import CalibratedViews, folded, turn_with
 from udccal.fitting.geometry.data import BoardView, GeometryData, gather
 from udccal.fitting.geometry.views import calibrate_views, check_picture
@@ -59,7 +59,7 @@ def fit_geometry(
         start: intrinsics to start from. The views' vanishing points (Zhang, 2000) give another start in any case; the
             lower minimum wins.
         sigmas: per view, one sigma in px of each point, up to a common factor; without it all points count alike.
-        prior: on the intrinsics, in the order of ``Intrinsics``; with it a single view may be enough.
+        prior: on the intrinsics, in the order of ``INTRINSIC_NAMES``; with it a single view may be enough.
         rules: see ``GeometryRules``.
 
     Returns:
@@ -71,7 +71,7 @@ def fit_geometry(
     """
     gathered = gather(board_points, image_points, sigmas, rules)
     check_picture(image_size, gathered.points)
-    lens = start or Intrinsics.centred(float(max(image_size)), image_size).camera()
+    lens = start or lens_alone(centred(float(max(image_size)), image_size))
     try:
         views = calibrate_views(gathered, image_size, start, prior, rules=rules)
     except FitError as error:
@@ -79,8 +79,7 @@ def fit_geometry(
     if views.rms_px > rules.no_corners_px:
         # No error bars hold for what is no lens.
         return FitResult.failed("geometry", lens, views.status, *views.notes)
-    x, cov = with_angles(views.intrinsics.vector, views.poses, views.cov, range(len(views.poses)), Rotation.identity())
-    return _result(views, x, cov, np.zeros(3), prior)
+    return _result(views, np.zeros(3), prior)
 
 
 def fit_boards(data: GeometryData, rules: GeometryRules = USUAL) -> FitResult[Geometry]:
@@ -114,8 +113,7 @@ def fit_boards(data: GeometryData, rules: GeometryRules = USUAL) -> FitResult[Ge
     if bundle.status is status or not on_jig:
         tilt = () if on_jig else ("No usable view shows the board parallel to the panel; capture that view again.",)
         return FitResult.failed("geometry", data.nominal, status, *lost, *bundle.notes, *tilt)
-    x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, on_jig)
-    result = _result(bundle, x, cov, np.asarray(data.nominal.pupil_mm, dtype=np.float64), data.prior, len(_NAMES))
+    result = _result(bundle, np.asarray(data.nominal.pupil_mm, dtype=np.float64), data.prior, on_jig)
     left_out, sentences = _outliers(bundle, views, rules)
     poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
     mounting = "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."
@@ -205,27 +203,23 @@ def _lost(views: Sequence[BoardView], rules: GeometryRules) -> Iterator[str]:
 
 
 def _result(
-    bundle: CalibratedViews,
-    x: Float[np.ndarray, "12"],
-    cov: Float[np.ndarray, "12 12"],
-    pupil_mm: Float[np.ndarray, "3"],
-    prior: Prior | None,
-    count: int = LENS,
+    bundle: CalibratedViews, pupil_mm: Float[np.ndarray, "3"], prior: Prior | None, on_jig: Sequence[int] | None = None
 ) -> FitResult[Geometry]:
-    """The result of a bundle, whose first ``count`` parameters are estimates.
+    """The result of a bundle, with the camera's mounting by the views ``on_jig``; without any, axes are the camera's.
 
     A pattern in the residuals is modelled as an error of the principal point, which moves every place by its size.
     """
-    pattern = bundle.evidence.pattern_px * np.eye(len(x))[:, 2:4]
-    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), partial(term_at, pupil=pupil_mm))
-    points, use = bundle.points, bundle.points.used
+    still, rotation = (range(len(bundle.poses)), Rotation.identity()) if on_jig is None else (on_jig, None)
+    x, cov = with_angles(bundle.intrinsics, bundle.poses, bundle.cov, still, rotation)
+    points, use, evidence, count = bundle.points, bundle.points.used, bundle.evidence, len(_NAMES) if on_jig else LENS
+    factor = np.hstack([square_root(cov), evidence.pattern_px * np.eye(len(x))[:, 2:4]])
+    posterior = Posterior(x, factor, partial(term_at, pupil=pupil_mm))
     z = bundle.residuals_px[use] / points.sigma[use, None]
     notes, held = bundle.notes, [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
     if held:
         zero = f"Held at 0, as the data do not ask for it: {', '.join(held)}."
         notes = (*notes, f"{zero} Their sigmas say how far from 0 they may be.")
     priors = None if prior is None else priors_of(INTRINSIC_NAMES, prior.mean, prior.sigma)
-    evidence = bundle.evidence
     diagnostics = (
         ("rms_reprojection", bundle.rms_px, "px"),
         ("views", len(points.names), "1"),
@@ -278,8 +272,7 @@ def with_angles(
 
 def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
     """The term of ``x``: intrinsics, tilt, roll and yaw in degrees; ``pupil`` in mm in panel coordinates."""
-    lens = Intrinsics.of(x[:LENS])
-    return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, turned_by(x[LENS:]), pupil)
+    return replace(lens_alone(x), rotation_rad=turned_by(x[LENS:]), pupil_mm=pupil)
 
 
 def _outliers(

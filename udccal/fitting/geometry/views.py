@@ -27,9 +27,10 @@ from udccal.fitting.geometry.bundle import (
     Bundle,
     BundleProblem,
     GeometryRules,
-    Intrinsics,
     Points,
     Solved,
+    centred,
+    intrinsics_of,
     linearised,
     solve,
 )
@@ -100,7 +101,7 @@ def calibrate_views(
     places = (f"view {points.names[points.view[k]]}, point {points.index[k]}" for k in np.flatnonzero(~points.used))
     status, advice = status_of(solved, cov, rms_px(residuals_px, points), image_size, rules)
     return CalibratedViews(
-        intrinsics=Intrinsics.of(bundle.intrinsics),
+        intrinsics=bundle.intrinsics,
         poses=bundle.poses,
         cov=cov,
         points=points,
@@ -121,8 +122,8 @@ def starts(
     points: Points, size: tuple[int, int], given: Geometry | None, poses: Float[np.ndarray, "views 6"] | None
 ) -> list[Bundle]:
     """Starts: from the given intrinsics, and from the views' vanishing points or else a common lens."""
-    lenses = [] if given is None else [Intrinsics.of_geometry(given).vector]
-    lenses.append(Intrinsics.centred(_focal_px(points, size), size).vector)
+    lenses = [] if given is None else [intrinsics_of(given)]
+    lenses.append(centred(_focal_px(points, size), size))
     found = [Bundle(lens, best_poses(points, lens)[0]) for lens in lenses]
     if poses is not None:
         found[0] = replace(found[0], poses=np.asarray(poses, dtype=np.float64)[list(points.names)])
