@@ -55,8 +55,8 @@ def test_the_lens_is_found_within_its_sigma(plain: CalibratedViews) -> None:
     assert next(c.name for c in plain.candidates if c.chosen) == "k1 k2 p1 p2"
     assert np.abs(errors(plain)).max() < 4
     assert plain.chi2_dof == pytest.approx(1.0, abs=0.15)
-    assert not plain.evidence.views.found
-    assert not plain.evidence.pattern.found
+    assert not plain.disagreement.found
+    assert not plain.pattern.found
 
 
 @pytest.mark.parametrize("factor", [0.3, 0.8, 1.2, 4.0])

@@ -56,10 +56,10 @@ def test_a_pattern_in_the_residuals_is_flagged_and_widens_the_rays(plain: Calibr
     board, image, sigma = arrays()
     bent = [view + 0.3 * np.sin(view[:, ::-1] / 40.0) for view in image]
     found = calibrated(board, bent, SCENE.size, sigmas=sigma)
-    assert found.evidence.pattern.p_value < 1e-3 < plain.evidence.pattern.p_value
-    assert 0.03 < found.evidence.pattern_px < 0.4
+    assert found.pattern.p_value < 1e-3 < plain.pattern.p_value
+    assert 0.03 < found.pattern_px < 0.4
     assert any("pattern over the picture" in note for note in found.notes)
-    assert (trace(found, Gauge.ALIGNED) > trace(plain, Gauge.ALIGNED) + found.evidence.pattern_px**2).all()
+    assert (trace(found, Gauge.ALIGNED) > trace(plain, Gauge.ALIGNED) + found.pattern_px**2).all()
 
 
 def test_views_of_different_lenses_disagree_and_widen_all(plain: CalibratedViews) -> None:
@@ -67,8 +67,8 @@ def test_views_of_different_lenses_disagree_and_widen_all(plain: CalibratedViews
     board, image, sigma = arrays()
     squeezed = [view + np.array([1.0, -1.0]) * 0.002 * (k % 2) * (view - 400) for k, view in enumerate(image)]
     found = calibrated(board, squeezed, SCENE.size, sigmas=sigma)
-    assert found.evidence.views.found
-    assert not plain.evidence.views.found
+    assert found.disagreement.found
+    assert not plain.disagreement.found
     assert found.cov[0, 0] > 4 * plain.cov[0, 0]
     assert any("disagree" in note for note in found.notes)
 
@@ -90,7 +90,7 @@ def test_error_bars_of_views_that_disagree_are_those_of_drawn_lenses() -> None:
             exact = projected(truth, there)[0]
             pictures.append(np.where(seen[:, None], exact + sigma[:, None] * rng.standard_normal(exact.shape), np.nan))
         found = calibrated([flat] * 12, pictures, scene.size)
-        assert found.evidence.views.found
+        assert found.disagreement.found
         free = np.array(found.free)
         z.append(((found.intrinsics - truth) / np.sqrt(np.diag(found.cov)[:9] + ~free))[:4])
         scale = np.median(found.points.sigma) / np.median(plain.points.sigma)

@@ -11,7 +11,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy.spatial.transform import Rotation
 
 from udccal.fitting.engine.gaussian import Prior
@@ -163,6 +163,10 @@ class Points:
         parts = (self.board[stay], self.image[stay], self.sigma[stay], number[stay])
         return Points(*parts, self.index[stay], self.used[stay], tuple(np.array(self.names)[~views].tolist()))
 
+    def split(self, values: Shaped[np.ndarray, "points *n"]) -> list[Shaped[np.ndarray, "_ *n"]]:
+        """What belongs to each view's points."""
+        return np.split(values, np.flatnonzero(np.diff(self.view)) + 1)
+
     def sums(self, values: Float[np.ndarray, " points"]) -> Float[np.ndarray, " views"]:
         """Sums over each view's points in use."""
         return np.bincount(self.view[self.used], values[self.used], len(self.names))
@@ -232,7 +236,7 @@ class BundleProblem:
         if self.robust is not None:
             root, loss = np.sqrt(self.robust.weight(np.sqrt(loss))), self.robust.loss(np.sqrt(loss))
             z, jacobian = z * root[:, None], jacobian * root[:, None, None]
-        for mine in np.split(np.arange(len(z)), np.flatnonzero(np.diff(self.points.view)) + 1):
+        for mine in self.points.split(np.arange(len(z))):
             slopes, errors = jacobian[mine].reshape(-1, LENS + 6), z[mine].ravel()
             whole, right, used = slopes.T @ slopes, -slopes.T @ errors, 2 * int(self.points.used[mine].sum())
             # Each intrinsic gets this part of the information that known poses would bring: an intrinsic that views

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import cv2
@@ -46,21 +46,8 @@ class Gauge(enum.Enum):
 
 @final
 @dataclass(frozen=True)
-class Evidence:
-    """Tests of residuals averaged over cells of the sensor, and of the intrinsics that each view prefers.
-
-    ``pattern_px`` is the size of the pattern per axis beyond noise; 0 unless found.
-    """
-
-    pattern: MisfitTest
-    views: MisfitTest
-    pattern_px: float
-
-
-@final
-@dataclass(frozen=True)
 class CalibratedViews:
-    """Intrinsics and poses with their uncertainty, and the evidence for them.
+    """Intrinsics and poses with their uncertainty, and tests of them.
 
     Attributes:
         intrinsics: in the order of ``INTRINSIC_NAMES``; those that the data do not ask for are 0, and not ``free``.
@@ -71,6 +58,9 @@ class CalibratedViews:
         residuals_px: projected minus seen, of these points.
         chi2_dof: scatter over the given sigma, squared; 1 where none was given.
         candidates: the orders of the distortion, by BIC.
+        disagreement: test of the intrinsics that each view prefers.
+        pattern, pattern_px: test of residuals averaged over cells of the sensor; the size of their pattern per axis
+            beyond noise, 0 unless found.
         status: ``CONVERGED``, or the reason not to use this; ``notes`` say what to do.
         iterations: of the last solve with all distortions free.
     """
@@ -83,7 +73,9 @@ class CalibratedViews:
     free: tuple[bool, ...]
     chi2_dof: float
     candidates: tuple[Candidate, ...]
-    evidence: Evidence
+    disagreement: MisfitTest
+    pattern: MisfitTest
+    pattern_px: float
     status: FitStatus
     notes: tuple[str, ...]
     outliers: tuple[Outliers, ...]
@@ -108,7 +100,7 @@ class CalibratedViews:
         by_lens, by_turn = self._ray_slopes(np.asarray(pixels, dtype=np.float64))
         slope = by_turn @ self.turn(gauge)
         slope[..., :LENS] += by_lens
-        return slope @ self.cov @ np.swapaxes(slope, 1, 2) + self.evidence.pattern_px**2 * np.eye(2)
+        return slope @ self.cov @ np.swapaxes(slope, 1, 2) + self.pattern_px**2 * np.eye(2)
 
     def turn(self, gauge: Gauge) -> Float[np.ndarray, "3 n"]:
         """Derivatives of the rays' rotation, in camera coordinates, by the intrinsics and poses."""
@@ -163,14 +155,14 @@ def turn_with(poses: Float[np.ndarray, "views 6"], views: Sequence[int]) -> Floa
     return turn
 
 
-def weigh(
-    solved: Solved, points: Points, free: Bool[np.ndarray, "9"], image_size: tuple[int, int], dof: float, cells: int
-) -> tuple[Evidence, Float[np.ndarray, "n n"]]:
-    """Tests of a solution, and its covariance, widened where the views disagree; ``dof`` are those behind sigma.
+def disagreement(
+    solved: Solved, points: Points, free: Bool[np.ndarray, "9"], dof: float
+) -> tuple[MisfitTest, Float[np.ndarray, "n n"]]:
+    """Test of the lenses that each view prefers, and a covariance that is wider where they disagree.
 
     The lens then has the spread that it has when one view after another is left out, and the poses follow. Its 95 %
     intervals hold 93 to 98 % where boards are bent or lenses move; with one factor for all (Birge, 1932) they hold 83
-    to 99 %. Only its own view determines a pose.
+    to 99 %. Only its own view determines a pose. ``dof`` are the degrees of freedom behind sigma.
     """
     parts = [one.marginal() for one in BundleProblem(points, free).by_view(solved.place)]
     # Each view's information on the free intrinsics, its pose eliminated; all views together have the size 1.
@@ -182,17 +174,17 @@ def weigh(
     values, vectors = np.linalg.eigh(information)
     seen = values > 1e-9 * np.maximum(values[:, -1:], 1e-9)
     along = np.einsum("kij,ki->kj", vectors, score)
-    views = f_test(float((along[seen] ** 2 / values[seen]).sum()), int(seen.sum()) - len(unit), dof)
-    lens, (pattern, size) = solved.equations.cov(), _pattern(solved, points, image_size, dof, cells)
-    if views.found:
+    test = f_test(float((along[seen] ** 2 / values[seen]).sum()), int(seen.sum()) - len(unit), dof)
+    lens = solved.equations.cov()
+    if test.found:
         lens[among] = clustered_cov(lens[among] / units, score, information) * units
-    return Evidence(pattern, views, size if pattern.found else 0.0), solved.equations.joint_cov(lens, views.inflation)
+    return test, solved.equations.joint_cov(lens, test.inflation)
 
 
-def _pattern(
+def residual_pattern(
     solved: Solved, points: Points, image_size: tuple[int, int], dof: float, cells: int
 ) -> tuple[MisfitTest, float]:
-    """Test of sums over the cells of a grid by their covariance under the model, and the pattern's size in px.
+    """Test of sums over the cells of a grid by their covariance under the model, and the size in px of what it found.
 
     ``group_means_test`` does not serve here: the fit absorbs most of a smooth pattern, so that means of cells scatter
     far less than those of independent residuals. The covariance of the sums accounts for that.
@@ -212,10 +204,10 @@ def _pattern(
     expected = np.diag(count) - flat @ solved.equations.joint_cov() @ flat.T
     values, vectors = np.linalg.eigh(expected)
     seen = values > 1e-6 * count.max()
-    found = f_test(float(((vectors[:, seen].T @ sums) ** 2 / values[seen]).sum()), int(seen.sum()), dof)
+    test = f_test(float(((vectors[:, seen].T @ sums) ** 2 / values[seen]).sum()), int(seen.sum()), dof)
     # Mean over the points of the squared mean of their cell, less the part that noise has in it.
-    excess = float(((sums**2 - np.diag(expected)) / count).sum() / count.sum())
-    return found, float(np.sqrt(max(excess, 0.0) * np.mean(points.sigma[points.used] ** 2)))
+    excess = test.found * float(((sums**2 - np.diag(expected)) / count).sum() / count.sum())
+    return test, float(np.sqrt(max(excess, 0.0) * np.mean(points.sigma[points.used] ** 2)))
 
 
 def folded(pixels: Float[np.ndarray, "n 2"]) -> str:
@@ -227,46 +219,52 @@ def folded(pixels: Float[np.ndarray, "n 2"]) -> str:
     )
 
 
-def status_of(
-    solved: Solved, cov: Float[np.ndarray, "n n"], off_px: float, image_size: tuple[int, int], rules: GeometryRules
-) -> tuple[FitStatus, tuple[str, ...]]:
-    """Whether the views determine the lens, with residuals of RMS ``off_px``; else what to capture."""
+def judged(
+    found: CalibratedViews, scales: Float[np.ndarray, " views"], by_prior: bool, rules: GeometryRules
+) -> CalibratedViews:
+    """With a status that says whether the views determine the lens, and notes; ``scales`` are the views' scatter."""
+    status, advice = _status(found, rules)
+    return replace(found, status=status, notes=(*found.notes, *advice, *_remarks(found, scales, by_prior, rules)))
+
+
+def _status(found: CalibratedViews, rules: GeometryRules) -> tuple[FitStatus, tuple[str, ...]]:
     order = "Check that the points of each view are in the order of the board's."
-    if off_px > rules.no_corners_px:
+    if found.rms_px > rules.no_corners_px:
         return FitStatus.POOR_FIT, (
-            f"Expected corners within {rules.no_corners_px:g} px of the fitted lens, found {off_px:.3g} px (RMS): no "
-            f"lens puts these board points there. {order}",
+            f"Expected corners within {rules.no_corners_px:g} px of the fitted lens, found {found.rms_px:.3g} px "
+            f"(RMS): no lens puts these board points there. {order}",
         )
-    sigma = np.sqrt(np.diag(cov))[:4] / [*np.abs(solved.place.intrinsics[:2]), image_size[0], image_size[0]]
+    width = found.image_size[0]
+    sigma = np.sqrt(np.diag(found.cov))[:4] / [*np.abs(found.intrinsics[:2]), width, width]
     if sigma.max() > rules.most_uncertain:
         what = "focal length" if sigma.argmax() < 2 else "centre of the picture"
         return FitStatus.TOO_FEW_DATA, (
             f"The views do not determine the {what} (one sigma is {min(sigma.max(), 99.0):.0%}). "
             "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
         )
-    return (FitStatus.CONVERGED, ()) if solved.converged else (FitStatus.NOT_CONVERGED, (order,))
+    return found.status, () if found.status is FitStatus.CONVERGED else (order,)
 
 
-def remarks(
-    points: Points, scales: Float[np.ndarray, " views"], evidence: Evidence, by_prior: bool, rules: GeometryRules
+def _remarks(
+    found: CalibratedViews, scales: Float[np.ndarray, " views"], by_prior: bool, rules: GeometryRules
 ) -> Iterator[str]:
-    """What a person should know of a fit that can be used; ``scales`` are the views' scatter."""
+    """What a person should know of a fit that can be used."""
     if by_prior:
         yield (
             "The views alone do not determine the whole lens: what is known beforehand gives part of it, and every "
             "distortion coefficient stays free within that. Lean the board another way in each view to know more."
         )
     relative = scales / np.median(scales)
-    loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
+    loud = [f"{found.points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
     if loud:
         yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
-    if evidence.views.found:
+    if found.disagreement.found:
         yield (
-            f"The views disagree on the lens beyond their noise (ratio {evidence.views.ratio:.1f}, "
-            f"p = {evidence.views.p_value:.1g}); sigma is that of views that differ so. Is the board flat?"
+            f"The views disagree on the lens beyond their noise (ratio {found.disagreement.ratio:.1f}, "
+            f"p = {found.disagreement.p_value:.1g}); sigma is that of views that differ so. Is the board flat?"
         )
-    if evidence.pattern.found:
+    if found.pattern.found:
         yield (
-            f"The residuals follow a pattern over the picture (p = {evidence.pattern.p_value:.1g}, about "
-            f"{evidence.pattern_px:.3f} px): the lens bends rays in a way that no order has."
+            f"The residuals follow a pattern over the picture (p = {found.pattern.p_value:.1g}, about "
+            f"{found.pattern_px:.3f} px): the lens bends rays in a way that no order has."
         )

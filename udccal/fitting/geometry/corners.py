@@ -38,8 +38,8 @@ class Luminance:
 def luminance(mosaic: Float[np.ndarray, "rows columns"], variance: Float[np.ndarray, "rows columns"]) -> Luminance:
     """Grey picture on the mosaic's own pixels, whose black level is subtracted; ``variance`` is of single samples.
 
-    The four sites of the pattern are scaled to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16. That
-    moves no edge and removes the pattern.
+    The four sites of the pattern are scaled to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16. It gives
+    each site one quarter at every pixel and is symmetric: that removes the pattern and moves no edge.
     """
     grey, spread = np.asarray(mosaic, dtype=np.float64).copy(), np.asarray(variance, dtype=np.float64).copy()
     total = max(float(grey.mean()), 1e-12)
@@ -51,7 +51,6 @@ def luminance(mosaic: Float[np.ndarray, "rows columns"], variance: Float[np.ndar
 
 
 def _filtered(picture: Float[np.ndarray, "*stack rows columns"]) -> Float[np.ndarray, "*stack rows columns"]:
-    # It gives each of the four sites of the pattern one quarter at every pixel and is symmetric.
     taps = np.array([0.25, 0.5, 0.25])
     return np.asarray(convolve1d(convolve1d(picture, taps, axis=-2), taps, axis=-1), dtype=np.float64)
 
@@ -69,12 +68,30 @@ class BoardCorners:
 def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules = USUAL) -> BoardCorners:
     """Find a board's inner corners in a grey picture; the arrays are empty where there are none.
 
-    Errors are those of ``charuco_board``.
+    Those out of the picture, moved away or without contrast are left out. Errors are those of ``charuco_board``.
     """
     ids, rough = _detect(picture.grey, spec)
     if len(ids) < rules.least_corners:
-        return BoardCorners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0))
-    return _placed(picture, ids, rough, _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm), spec, rules)
+        return BoardCorners(ids[:0], rough[:0], np.zeros(0))
+    edges = _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
+    # Of a square: the distance from a corner to the markers.
+    margin = rules.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
+    side = np.linalg.norm(edges, axis=2).min(axis=1)
+    radius = np.clip(min(margin, rules.window_squares) * side, *rules.window_px)
+    half = int(np.ceil(radius.max())) + 1
+    base = np.clip(np.round(rough).astype(np.int64), half, np.array(picture.grey.shape[::-1]) - half - 1)
+    dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
+    where = (base[:, 1, None] + dy, base[:, 0, None] + dx)
+    angles = np.arctan2(edges[..., 0], -edges[..., 1])
+    start = np.concatenate([rough - base, angles, np.full((len(base), 2), np.log(1.5))], axis=1)
+    place, saddles = _fitted(start, np.stack([dx, dy], axis=1).astype(np.float64), picture.grey[where], radius)
+    xy, sigma = base + place, saddles.noise_sigma(picture.variance[where])
+    misfit = np.sqrt(saddles.cost / np.maximum(saddles.weight.sum(-1) - 10, 1.0))
+    inside = (base == np.round(rough)).all(axis=1)
+    near = np.linalg.norm(xy - rough, axis=1) < np.maximum(radius / 2, 3.0)
+    contrast = np.abs(saddles.contrast) > rules.least_contrast * misfit
+    good = inside & near & contrast & (sigma < rules.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
+    return BoardCorners(ids[good], xy[good], sigma[good])
 
 
 def _detect(
@@ -84,15 +101,15 @@ def _detect(
     low, high = np.percentile(grey, [0.5, 99.5])
     picture = np.round(255.0 * np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0)).astype(np.uint8)
     detector = cv2.aruco.CharucoDetector(charuco_board(spec))
-    best = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+    best = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
     for shrink in (1, 2):
-        if len(best[0]) == (spec.columns - 1) * (spec.rows - 1):
-            break
         small = picture if shrink == 1 else cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         corners, ids, _, _ = detector.detectBoard(small)
         if ids is not None and len(ids) > len(best[0]):
             xy = (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) * shrink - 0.5
-            best = (np.asarray(ids, dtype=np.int64).reshape(-1), xy)
+            best = np.asarray(ids, dtype=np.int64).reshape(-1), xy
+        if len(best[0]) == (spec.columns - 1) * (spec.rows - 1):
+            break
     return best
 
 
@@ -173,43 +190,23 @@ def _equations(
     return weighted @ slopes, weighted @ values[..., None]
 
 
-def _placed(
-    picture: Luminance,
-    ids: Int[np.ndarray, " n"],
-    rough: Float[np.ndarray, "n 2"],
-    edges: Float[np.ndarray, "n 2 2"],
-    spec: BoardSpec,
-    rules: GeometryRules,
-) -> BoardCorners:
-    """Place all corners at once; those out of the picture, moved away or without contrast are left out."""
-    margin = rules.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
-    side = np.linalg.norm(edges, axis=2).min(axis=1)
-    radius = np.clip(min(margin, rules.window_squares) * side, *rules.window_px)
-    half = int(np.ceil(radius.max())) + 1
-    last = np.array(picture.grey.shape[::-1]) - half - 1
-    base = np.clip(np.round(rough).astype(np.int64), half, last)
-    inside = (base == np.round(rough)).all(axis=1)
-    dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
-    where = (base[:, 1, None] + dy, base[:, 0, None] + dx)
-    windows = np.stack([dx, dy], axis=1).astype(np.float64), picture.grey[where], radius
-    angles = np.arctan2(edges[..., 0], -edges[..., 1])
-    shape = np.concatenate([rough - base, angles, np.full((len(base), 2), np.log(1.5))], axis=1)
-    saddles, damping = _Saddles.at(shape, *windows), np.full(len(base), 1e-3)
+def _fitted(
+    shape: Float[np.ndarray, "n 6"],
+    offsets: Float[np.ndarray, "m 2"],
+    samples: Float[np.ndarray, "n m"],
+    radius: Float[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, "n 2"], _Saddles]:
+    """The places of all corners, from a start of their shapes, by damped steps; see ``_Saddles``."""
+    saddles, damping = _Saddles.at(shape, offsets, samples, radius), np.full(len(shape), 1e-3)
     for _ in range(12):
         trial = shape + np.clip(saddles.step(damping), -1.0, 1.0)
         trial[:, 4:] = np.clip(trial[:, 4:], np.log(0.3), np.log(20.0))
-        tried = _Saddles.at(trial, *windows)
+        tried = _Saddles.at(trial, offsets, samples, radius)
         better = tried.cost < saddles.cost
         step = np.abs(trial - shape).max()
         shape = np.where(better[:, None], trial, shape)
-        saddles = tried if better.all() else _Saddles.at(shape, *windows)
+        saddles = tried if better.all() else _Saddles.at(shape, offsets, samples, radius)
         if step < 1e-4:  # The next one would be its square.
             break
         damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-9, 1e9)
-    sigma = saddles.noise_sigma(picture.variance[where])
-    misfit = np.sqrt(saddles.cost / np.maximum(saddles.weight.sum(-1) - 10, 1.0))
-    xy = base + shape[:, :2]
-    near = np.linalg.norm(xy - rough, axis=1) < np.maximum(radius / 2, 3.0)
-    contrast = np.abs(saddles.contrast) > rules.least_contrast * misfit
-    good = inside & near & contrast & (sigma < rules.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
-    return BoardCorners(ids[good], xy[good], sigma[good])
+    return shape[:, :2], saddles

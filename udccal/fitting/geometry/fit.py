@@ -211,8 +211,8 @@ def _result(
     """
     still, rotation = (range(len(bundle.poses)), Rotation.identity()) if on_jig is None else (on_jig, None)
     x, cov = with_angles(bundle.intrinsics, bundle.poses, bundle.cov, still, rotation)
-    points, use, evidence, count = bundle.points, bundle.points.used, bundle.evidence, len(_NAMES) if on_jig else LENS
-    factor = np.hstack([square_root(cov), evidence.pattern_px * np.eye(len(x))[:, 2:4]])
+    points, use, count = bundle.points, bundle.points.used, len(_NAMES) if on_jig else LENS
+    factor = np.hstack([square_root(cov), bundle.pattern_px * np.eye(len(x))[:, 2:4]])
     posterior = Posterior(x, factor, partial(term_at, pupil=pupil_mm))
     z = bundle.residuals_px[use] / points.sigma[use, None]
     notes, held = bundle.notes, [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
@@ -226,10 +226,10 @@ def _result(
         ("corners_used", use.sum(), "1"),
         ("corners_rejected", (~use).sum(), "1"),
         ("iterations", bundle.iterations, "1"),
-        ("views_disagree_p", evidence.views.p_value, "1"),
-        ("variance_factor", evidence.views.inflation, "1"),
-        ("residual_pattern_p", evidence.pattern.p_value, "1"),
-        ("residual_pattern", evidence.pattern_px, "px"),
+        ("views_disagree_p", bundle.disagreement.p_value, "1"),
+        ("variance_factor", bundle.disagreement.inflation, "1"),
+        ("residual_pattern_p", bundle.pattern.p_value, "1"),
+        ("residual_pattern", bundle.pattern_px, "px"),
     )
     return FitResult(
         name="geometry",

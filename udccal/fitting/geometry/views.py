@@ -8,6 +8,7 @@ is estimated. All views have one scale unless a test finds that they differ (by 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import final
 
 import cv2
@@ -34,14 +35,15 @@ from udccal.fitting.geometry.bundle import (
     linearised,
     solve,
 )
-from udccal.fitting.geometry.calibrated import CalibratedViews, remarks, rms_px, status_of, weigh
+from udccal.fitting.geometry.calibrated import CalibratedViews, disagreement, judged, residual_pattern
 from udccal.fitting.geometry.data import Gathered, best_poses
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
+from udccal.result import FitStatus
 
-# From the centres of the outermost pixels to the furthest place at which a detector finds a corner.
+# A detector finds corners up to so far beyond the centres of the outermost pixels.
 _BESIDE_PX = 1.0
-# Corners beyond that, and the part of all, which may be outliers.
+# So many corners beyond that, or such a part of all, may be outliers.
 _FEW_BESIDE, _PART_BESIDE = 3, 0.01
 
 
@@ -54,7 +56,7 @@ def calibrate_views(
     start_poses: Float[np.ndarray, "views 6"] | None = None,
     rules: GeometryRules = USUAL,
 ) -> CalibratedViews:
-    """Lens and poses with their covariance, and the evidence for them; ``fit_geometry`` makes the term of these.
+    """Lens and poses with their covariance, and tests of them; ``fit_geometry`` makes the term of these.
 
     Args:
         gathered: the points, from ``gather``.
@@ -77,8 +79,8 @@ def calibrate_views(
     robust = _Search(given, known, rules).best_of(starts(given, image_size, start, start_poses))
     scatters = f"scatters more than {rules.strange_view:g} times as much as the median view"
     repeats = "repeats another's corners to within a fraction of their scatter: it is no new measurement"
-    for judged, what in ((_strange, scatters), (_copies, repeats)):
-        out = judged(robust, rules, least)
+    for rule, what in ((_strange, scatters), (_copies, repeats)):
+        out = rule(robust, rules, least)
         if out.any():
             names = (f"view {given.names[k]}" for k in np.flatnonzero(out))
             left_out = (*left_out, *outliers(f"of a view that {what}", names))
@@ -93,29 +95,29 @@ def calibrate_views(
     orders, between = _choose_order(likely, known, rules)
     free = ORDERS[orders.best.name]
     final = _scaled(replace(likely, solved=orders.best.fit), likely.points, free, known)
-    points, solved = final.points, final.solved
-    evidence, cov = weigh(solved, points, free, image_size, final.dof, rules.pattern_cells)
-    cov = cov if between is None else cov + between
-    bundle = solved.place.facing()
-    residuals_px = linearised(bundle, points)[0]
+    points, solved, bundle = final.points, final.solved, final.solved.place.facing()
+    disagree, cov = disagreement(solved, points, free, final.dof)
+    pattern, pattern_px = residual_pattern(solved, points, image_size, final.dof, rules.pattern_cells)
     places = (f"view {points.names[points.view[k]]}, point {points.index[k]}" for k in np.flatnonzero(~points.used))
-    status, advice = status_of(solved, cov, rms_px(residuals_px, points), image_size, rules)
-    return CalibratedViews(
+    views = CalibratedViews(
         intrinsics=bundle.intrinsics,
         poses=bundle.poses,
-        cov=cov,
+        cov=cov if between is None else cov + between,
         points=points,
-        residuals_px=residuals_px,
+        residuals_px=linearised(bundle, points)[0],
         free=tuple(free.tolist()),
         chi2_dof=float(((points.sigma / given.sigma)[points.used] ** 2).mean()) if gathered.weighted else 1.0,
         candidates=orders.candidates,
-        evidence=evidence,
-        status=status,
-        notes=(*gathered.notes, *advice, *remarks(points, likely.scales, evidence, between is None, rules)),
+        disagreement=disagree,
+        pattern=pattern,
+        pattern_px=pattern_px,
+        status=FitStatus.CONVERGED if solved.converged else FitStatus.NOT_CONVERGED,
+        notes=gathered.notes,
         outliers=(*left_out, *rules.corners.listed(places)),
         iterations=likely.solved.iterations,
         image_size=image_size,
     )
+    return judged(views, likely.scales, between is None, rules)
 
 
 def starts(
@@ -132,14 +134,11 @@ def starts(
 
 def _focal_px(points: Points, size: tuple[int, int]) -> float:
     """One focal length for both axes by the views' vanishing points; that of a common lens where they give none."""
-    views = [points.view == k for k in range(len(points.names))]
-    board = [(points.board[mine] * np.array([1.0, 1.0, 0.0])).astype(np.float32) for mine in views]
-    image = [points.image[mine].astype(np.float32) for mine in views]
-    usual = float(max(size))
+    flat, usual = points.board * np.array([1.0, 1.0, 0.0]), float(max(size))
+    board, image = (points.split(part.astype(np.float32)) for part in (flat, points.image))
     try:
         focal = float(cv2.initCameraMatrix2D(board, image, size, 1.0)[0, 0])
-    except cv2.error:
-        # Points of a size beyond single precision.
+    except cv2.error:  # Points of a size beyond single precision.
         return usual
     # The model does not describe lenses outside this range.
     return focal if 0.15 * usual <= focal <= 30.0 * usual else usual
@@ -170,14 +169,14 @@ class _Search:
         found = [self._descended(one) for one in begun]
         best = min(found, key=lambda one: float(np.log1p(_squares(one.solved.place, self.given)).mean()))
         for _ in range(8):  # Views whose mirrored pose fits better take it, and all is solved again.
-            place = best.solved.place
-            mirrored = replace(place, poses=best_poses(best.points, place.intrinsics)[1])
-            other = solve(mirrored, best.points, ~EVERY, self.known).place
-            better = costs(other, best.points) < 0.99 * costs(place, best.points)
+            place, points = best.solved.place, best.points
+            mirrored = replace(place, poses=best_poses(points, place.intrinsics)[1])
+            other = solve(mirrored, points, ~EVERY, self.known).place
+            better = _costs(other, points) < 0.99 * _costs(place, points)
             if not better.any():
                 break
-            swapped = replace(place, poses=np.where(better[:, None], other.facing().poses, place.poses))
-            best = self._without_outliers(swapped)
+            poses = np.where(better[:, None], other.facing().poses, place.poses)
+            best = self._without_outliers(replace(place, poses=poses))
         return best
 
     def _descended(self, bundle: Bundle) -> _Fitted:
@@ -243,21 +242,19 @@ def _strange(robust: _Fitted, rules: GeometryRules, least: int) -> Bool[np.ndarr
 
 def _copies(robust: _Fitted, rules: GeometryRules, _: int) -> Bool[np.ndarray, " views"]:
     """Views that repeat an earlier one: the errors of a picture that is given twice are no independent ones."""
-    points, views = robust.points, len(robust.points.names)
-    used = [np.flatnonzero((points.view == view) & points.used) for view in range(views)]
-    corners = [{tuple(points.board[k]): k for k in mine} for mine in used]
-    copies = np.zeros(views, bool)
-    for later in range(views):
-        for first in np.flatnonzero(~copies[:later]):
-            common = corners[later].keys() & corners[first].keys()
-            pairs = np.array([(corners[later][at], corners[first][at]) for at in common], dtype=int).reshape(-1, 2).T
-            apart2 = ((points.image[pairs[0]] - points.image[pairs[1]]) ** 2).mean(axis=1)
-            alike = apart2.sum() < rules.copy * np.sum(points.sigma[pairs] ** 2)
-            copies[later] |= len(common) >= rules.least_corners and bool(alike)
+    points, views = robust.points, range(len(robust.points.names))
+    used = [np.flatnonzero((points.view == view) & points.used) for view in views]
+    corners, copies = [{tuple(points.board[k]): k for k in mine} for mine in used], np.zeros(len(views), dtype=bool)
+    for first, later in combinations(views, 2):
+        common = corners[first].keys() & corners[later].keys()
+        if not copies[first] and len(common) >= rules.least_corners:
+            a, b = np.array([(corners[first][at], corners[later][at]) for at in common]).T
+            apart2 = ((points.image[a] - points.image[b]) ** 2).mean(axis=1).sum()
+            copies[later] |= apart2 < rules.copy * (points.sigma[[a, b]] ** 2).sum()
     return copies
 
 
-def costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
+def _costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
     """Chi-squared of each view."""
     return points.sums(_squares(bundle, points))
 
@@ -280,7 +277,7 @@ def _scaled(fitted: _Fitted, given: Points, free: Bool[np.ndarray, "9"], prior: 
     """
     solved, points, scales = fitted.solved, fitted.points, np.ones(len(given.names))
     for _ in range(8):
-        square, dof = costs(solved.place, given), 2 * given.sums(np.ones(len(given.view)))
+        square, dof = _costs(solved.place, given), 2 * given.sums(np.ones(len(given.view)))
         # Less what the fit uses: a pose, and the trace of the lens's information times its covariance.
         lens = solved.equations.cov()
         dof -= [6 + np.sum(one.marginal()[0] * lens) for one in BundleProblem(points, free).by_view(solved.place)]
@@ -325,7 +322,7 @@ def _choose_order(
             above = Bundle(np.where(free, solved.place.intrinsics, 0.0), solved.place.poses)
             solved = solve(above, points, free, prior)
         parameters = int(free.sum()) + solved.place.poses.size
-        noise = max(float(costs(solved.place, points).sum()), rounding) / samples
+        noise = max(float(_costs(solved.place, points).sum()), rounding) / samples
         criterion = bic(samples * float(np.log(noise)), float(parameters), samples) + float(price)
         tried.insert(0, Attempt(name, parameters, criterion, solved))
     known = np.diag(full.solved.equations.cov()) * np.diag(prior.precision)
