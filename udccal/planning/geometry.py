@@ -24,9 +24,9 @@ from udccal.fitting.engine.orders import bic
 from udccal.fitting.geometry.bundle import (
     EVERY,
     ORDERS,
+    RULES,
     Bundle,
     BundleProblem,
-    GeometryRules,
     Points,
     intrinsics_of,
     projected,
@@ -49,7 +49,6 @@ _WINDOW_SQUARES = 0.16
 _ACROSS = 17
 # Stands for endless views.
 _MANY = 1e6
-_RULES = GeometryRules()
 
 
 @final
@@ -87,7 +86,7 @@ class BoardViews:
         # Only corners with both markers in the picture count: without these the detector does not know their numbers.
         near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < spec.square_mm
         good = self._inside(image, np.ceil(radius) + 1) & ~(near & ~whole).any(axis=1)
-        if depth <= 0 or good.sum() < _RULES.least_corners:
+        if depth <= 0 or good.sum() < RULES.least_corners:
             return None
         pose = np.append(rotation.as_rotvec(), origin)
         sigma = self._sigma_px(step, image[good], radius, board.parallel_to_panel)
@@ -119,7 +118,7 @@ class BoardViews:
 
     def _window_px(self, spec: BoardSpec, depth_mm: float) -> float:
         square_px = spec.square_mm / depth_mm * self.intrinsics[0]
-        return float(np.clip(_WINDOW_SQUARES * square_px, *_RULES.window_px))
+        return float(np.clip(_WINDOW_SQUARES * square_px, *RULES.window_px))
 
     def _inside(self, pixels: Float[np.ndarray, "n 2"], margin: float) -> Bool[np.ndarray, " n"]:
         last = np.array([self._state.rig.camera.columns, self._state.rig.camera.rows]) - 1 - margin

@@ -14,8 +14,8 @@ from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.geometry.bundle import (
     INTRINSIC_NAMES,
     LENS,
+    RULES,
     Bundle,
-    GeometryRules,
     Points,
     in_sigma,
     intrinsics_of,
@@ -49,15 +49,14 @@ def judge_geometry(
     views: Sequence[BoardView], result: FitResult[Geometry], image_size: tuple[int, int], limits: ValidationLimits
 ) -> Judged:
     """Judge corners with free poses, patterns in them, and the camera's turn by the board on its jig."""
-    rules = GeometryRules()
-    views = [view for view in views if view.usable(rules)]
+    views = [view for view in views if view.usable()]
     if not views:
         return unusable("geometry", "No board shows enough corners. Capture the boards again, evenly lit and sharp.")
     lens = intrinsics_of(result.term)
-    given = _points(views, result, rules)
+    given = _points(views, result)
     if not given.names:
         return unusable("geometry", "No board holds a pose. Capture boards that show two rows of corners or more.")
-    points, place = _posed(given, lens, rules)
+    points, place = _posed(given, lens)
     strange = _strange_check([views[k].step_id for k in given.names if k not in points.names])
     if not points.names:
         return unusable("geometry", strange[0].what)
@@ -67,7 +66,7 @@ def judge_geometry(
     # Boards by hand scatter unequally, by blur and light: as in the fit, each view has a scale of its own.
     points = points.scaled(np.sqrt(np.maximum(ratios, 1.0)))
     found = _prediction(points, place, result)
-    cell, shape = _cells(points, image_size, rules.pattern_cells)
+    cell, shape = _cells(points, image_size, RULES.pattern_cells)
     test, size = found.pattern(np.repeat(cell, 2) * 2 + np.tile([0, 1], len(cell)))
     unit = float(np.sqrt(np.mean(points.sigma[points.used] ** 2)))
     off = rms_px(linearised(place, points)[0], points)
@@ -99,19 +98,18 @@ def judge_geometry(
     return Judged(checks, ZMap(_cell_means(found.z, cell, shape), "x", "y", caption))
 
 
-def _points(views: Sequence[BoardView], result: FitResult[Geometry], rules: GeometryRules) -> Points:
+def _points(views: Sequence[BoardView], result: FitResult[Geometry]) -> Points:
     """The corners of all views, with noise and the scatter that the profile states."""
     stated = [result.diagnostic(ON_JIG if view.parallel else BY_HAND) for view in views]
-    scatter = [rules.start_scatter_px if own is None else own for own in stated]
+    scatter = [RULES.start_scatter_px if own is None else own for own in stated]
     return gather(
         [board_points_mm(view.spec)[view.corners.ids] for view in views],
         [view.corners.xy for view in views],
         [np.maximum(np.hypot(v.corners.sigma, own), 1e-3) for v, own in zip(views, scatter, strict=True)],
-        rules,
     ).points
 
 
-def _posed(points: Points, lens: Float[np.ndarray, "9"], rules: GeometryRules) -> tuple[Points, Bundle]:
+def _posed(points: Points, lens: Float[np.ndarray, "9"]) -> tuple[Points, Bundle]:
     """The best pose of every view with the lens held, without outliers, which are marked.
 
     A view of which they leave too few corners, or less than half, is left out whole: it has no pose that could be told.
@@ -120,9 +118,9 @@ def _posed(points: Points, lens: Float[np.ndarray, "9"], rules: GeometryRules) -
     for _ in range(2):
         place = solve(place, points, held).place
         size = np.abs(linearised(place, points)[0] / points.sigma[:, None]).max(axis=1)
-        points = replace(points, used=~rules.corners.off(size))
+        points = replace(points, used=~RULES.corners.off(size))
     every = np.bincount(points.view, minlength=len(points.names))
-    strange = points.sums(np.ones(len(points.used))) < np.maximum(rules.least_corners, 0.5 * every)
+    strange = points.sums(np.ones(len(points.used))) < np.maximum(RULES.least_corners, 0.5 * every)
     points, place = points.without(strange), Bundle(lens, place.poses[~strange])
     return points, solve(place, points, held).place if points.names else place
 

@@ -13,7 +13,6 @@ from udccal.fitting.geometry.bundle import (
     EVERY,
     ORDERS,
     Bundle,
-    GeometryRules,
     Solved,
     camera_matrix,
     intrinsics_of,
@@ -25,7 +24,7 @@ from udccal.fitting.geometry.data import best_poses, gather
 from udccal.fitting.geometry.views import starts
 from udccal.models.geometry import project, rotation_matrix
 
-POINTS = gather(*arrays(), GeometryRules()).points
+POINTS = gather(*arrays()).points
 TRUTH = Bundle(intrinsics_of(SCENE.camera), SCENE.poses)
 NO_PRIOR = Prior(np.zeros(9), np.zeros((0, 9)))
 
@@ -106,9 +105,7 @@ def test_what_exact_parallel_boards_do_not_tell_is_very_unsure() -> None:
     poses[:, :3] = 0.0
     places = linearised(Bundle(TRUTH.intrinsics, poses), POINTS)[0] + POINTS.image
     board, view = POINTS.board, POINTS.view
-    parallel = gather(
-        [board[view == k] for k in range(8)], [places[view == k] for k in range(8)], None, GeometryRules()
-    ).points
+    parallel = gather([board[view == k] for k in range(8)], [places[view == k] for k in range(8)]).points
     found = solve(Bundle(TRUTH.intrinsics, poses), parallel, EVERY, NO_PRIOR)
     assert np.sqrt(found.equations.joint_cov()[0, 0]) > 0.05 * TRUTH.intrinsics[0]
 
@@ -124,7 +121,7 @@ def test_the_first_focal_length_comes_from_the_views() -> None:
     begun = starts(POINTS, SCENE.size, None, None)
     assert len(begun) == 1
     np.testing.assert_allclose(begun[0].intrinsics[:2], 870.0, rtol=0.1)
-    flat = gather(*arrays(sight(views=8, lean_rad=0.0, tilt_deg=0.0)), GeometryRules()).points
+    flat = gather(*arrays(sight(views=8, lean_rad=0.0, tilt_deg=0.0))).points
     assert np.isfinite(starts(flat, SCENE.size, None, None)[0].intrinsics).all()
 
 
@@ -139,7 +136,7 @@ def test_boards_behind_the_camera_are_turned_to_its_front() -> None:
 def test_corners_come_in_the_shapes_that_opencv_gives() -> None:
     board, image, sigma = arrays()
     stacked = [view.astype(np.float32)[:, None] for view in board], [view[:, None] for view in image], sigma
-    again = gather(*stacked, GeometryRules()).points
+    again = gather(*stacked).points
     np.testing.assert_array_equal(again.image, POINTS.image)
     np.testing.assert_array_equal(again.board, POINTS.board)
 
@@ -147,8 +144,8 @@ def test_corners_come_in_the_shapes_that_opencv_gives() -> None:
 def test_arrays_that_do_not_belong_together_are_refused() -> None:
     board, image, sigma = arrays()
     with pytest.raises(FitError, match="as many views"):
-        gather(board[1:], image, sigma, GeometryRules())
+        gather(board[1:], image, sigma)
     with pytest.raises(FitError, match=r"view 3, found \(48, 3\), \(47, 2\)"):
-        gather(board, [*image[:3], image[3][1:], *image[4:]], None, GeometryRules())
+        gather(board, [*image[:3], image[3][1:], *image[4:]])
     with pytest.raises(FitError, match="view 0"):
-        gather(board, [view.T for view in image], None, GeometryRules())
+        gather(board, [view.T for view in image])

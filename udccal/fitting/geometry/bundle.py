@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import Final, final
 
 import cv2
 import numpy as np
@@ -92,7 +92,7 @@ class GeometryRules:
     worst_corner_sigma_px: float = 1.0
 
 
-USUAL = GeometryRules()
+RULES: Final = GeometryRules()
 
 
 def intrinsics_of(geometry: Geometry) -> Float[np.ndarray, "9"]:

@@ -21,8 +21,8 @@ from udccal.errors import FitError
 from udccal.fitting.engine.misfit import MisfitTest, clustered_cov, f_test
 from udccal.fitting.geometry.bundle import (
     LENS,
+    RULES,
     BundleProblem,
-    GeometryRules,
     Points,
     Solved,
     camera_matrix,
@@ -219,24 +219,22 @@ def folded(pixels: Float[np.ndarray, "n 2"]) -> str:
     )
 
 
-def judged(
-    found: CalibratedViews, scales: Float[np.ndarray, " views"], by_prior: bool, rules: GeometryRules
-) -> CalibratedViews:
+def judged(found: CalibratedViews, scales: Float[np.ndarray, " views"], by_prior: bool) -> CalibratedViews:
     """With a status that says whether the views determine the lens, and notes; ``scales`` are the views' scatter."""
-    status, advice = _status(found, rules)
-    return replace(found, status=status, notes=(*found.notes, *advice, *_remarks(found, scales, by_prior, rules)))
+    status, advice = _status(found)
+    return replace(found, status=status, notes=(*found.notes, *advice, *_remarks(found, scales, by_prior)))
 
 
-def _status(found: CalibratedViews, rules: GeometryRules) -> tuple[FitStatus, tuple[str, ...]]:
+def _status(found: CalibratedViews) -> tuple[FitStatus, tuple[str, ...]]:
     order = "Check that the points of each view are in the order of the board's."
-    if found.rms_px > rules.no_corners_px:
+    if found.rms_px > RULES.no_corners_px:
         return FitStatus.POOR_FIT, (
-            f"Expected corners within {rules.no_corners_px:g} px of the fitted lens, found {found.rms_px:.3g} px "
+            f"Expected corners within {RULES.no_corners_px:g} px of the fitted lens, found {found.rms_px:.3g} px "
             f"(RMS): no lens puts these board points there. {order}",
         )
     width = found.image_size[0]
     sigma = np.sqrt(np.diag(found.cov))[:4] / [*np.abs(found.intrinsics[:2]), width, width]
-    if sigma.max() > rules.most_uncertain:
+    if sigma.max() > RULES.most_uncertain:
         what = "focal length" if sigma.argmax() < 2 else "centre of the picture"
         return FitStatus.TOO_FEW_DATA, (
             f"The views do not determine the {what} (one sigma is {min(sigma.max(), 99.0):.0%}). "
@@ -245,9 +243,7 @@ def _status(found: CalibratedViews, rules: GeometryRules) -> tuple[FitStatus, tu
     return found.status, () if found.status is FitStatus.CONVERGED else (order,)
 
 
-def _remarks(
-    found: CalibratedViews, scales: Float[np.ndarray, " views"], by_prior: bool, rules: GeometryRules
-) -> Iterator[str]:
+def _remarks(found: CalibratedViews, scales: Float[np.ndarray, " views"], by_prior: bool) -> Iterator[str]:
     """What a person should know of a fit that can be used."""
     if by_prior:
         yield (
@@ -255,7 +251,7 @@ def _remarks(
             "distortion coefficient stays free within that. Lean the board another way in each view to know more."
         )
     relative = scales / np.median(scales)
-    loud = [f"{found.points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
+    loud = [f"{found.points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > RULES.loud_view)]
     if loud:
         yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
     if found.disagreement.found:

@@ -23,7 +23,7 @@ from scipy.special import erf
 from udccal.arrangements import BoardSpec
 from udccal.board.charuco import board_points_mm, charuco_board
 from udccal.cfa import cfa_named
-from udccal.fitting.geometry.bundle import USUAL, GeometryRules
+from udccal.fitting.geometry.bundle import RULES
 
 
 @final
@@ -65,19 +65,19 @@ class BoardCorners:
     sigma: Float[np.ndarray, " n"]
 
 
-def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules = USUAL) -> BoardCorners:
+def detect_corners(picture: Luminance, spec: BoardSpec) -> BoardCorners:
     """Find a board's inner corners in a grey picture; the arrays are empty where there are none.
 
     Those out of the picture, moved away or without contrast are left out. Errors are those of ``charuco_board``.
     """
     ids, rough = _detect(picture.grey, spec)
-    if len(ids) < rules.least_corners:
+    if len(ids) < RULES.least_corners:
         return BoardCorners(ids[:0], rough[:0], np.zeros(0))
     edges = _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
     # Of a square: the distance from a corner to the markers.
-    margin = rules.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
+    margin = RULES.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
     side = np.linalg.norm(edges, axis=2).min(axis=1)
-    radius = np.clip(min(margin, rules.window_squares) * side, *rules.window_px)
+    radius = np.clip(min(margin, RULES.window_squares) * side, *RULES.window_px)
     half = int(np.ceil(radius.max())) + 1
     base = np.clip(np.round(rough).astype(np.int64), half, np.array(picture.grey.shape[::-1]) - half - 1)
     dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
@@ -89,8 +89,8 @@ def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules = U
     misfit = np.sqrt(saddles.cost / np.maximum(saddles.weight.sum(-1) - 10, 1.0))
     inside = (base == np.round(rough)).all(axis=1)
     near = np.linalg.norm(xy - rough, axis=1) < np.maximum(radius / 2, 3.0)
-    contrast = np.abs(saddles.contrast) > rules.least_contrast * misfit
-    good = inside & near & contrast & (sigma < rules.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
+    contrast = np.abs(saddles.contrast) > RULES.least_contrast * misfit
+    good = inside & near & contrast & (sigma < RULES.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
     return BoardCorners(ids[good], xy[good], sigma[good])
 
 

@@ -8,7 +8,7 @@ correction, with the panel as part of the camera). That corrects unequal pixels 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import cv2
@@ -22,7 +22,7 @@ from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.geometry.bundle import USUAL, GeometryRules, Points, camera_matrix, intrinsics_of
+from udccal.fitting.geometry.bundle import RULES, Points, camera_matrix, intrinsics_of
 from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.wire.data import read_wire
@@ -50,9 +50,9 @@ class BoardView:
     corners: BoardCorners
     clipped: float
 
-    def usable(self, rules: GeometryRules = USUAL) -> bool:
+    def usable(self) -> bool:
         """Whether enough corners were found in an unclipped picture."""
-        return len(self.corners.ids) >= rules.least_corners and self.clipped <= rules.most_clipped
+        return len(self.corners.ids) >= RULES.least_corners and self.clipped <= RULES.most_clipped
 
 
 @final
@@ -70,7 +70,7 @@ class GeometryData:
     prior: Prior | None = None
 
 
-def read_geometry(session: Session, noise: Noise, rules: GeometryRules = USUAL) -> GeometryData:
+def read_geometry(session: Session, noise: Noise) -> GeometryData:
     """Read the boards of all steps ``geometry/*``, and the prior on the lens from the rig's description.
 
     The noise term gives the black level, the saturation and the corners' sigma.
@@ -85,23 +85,20 @@ def read_geometry(session: Session, noise: Noise, rules: GeometryRules = USUAL) 
     flat = FlatField(np.ones(shape), np.full(shape, float(np.asarray(noise.PRNU1288)) ** 2))
     if {"wire/dark", "wire/flat"} <= {step.id for step in session.steps("wire")}:
         wire = read_wire(session, noise, nominal)
-        flat = flat_field(wire.signal.astype(np.float64), wire.variance, wire.signal < wire.clip, rules)
+        flat = flat_field(wire.signal.astype(np.float64), wire.variance, wire.signal < wire.clip)
     views = []
     for step in session.steps("geometry"):
         if isinstance(board := step.subject, BoardSubject):
             spec = BoardSpec(board.columns, board.rows, board.square_mm, board.marker_mm, board.dictionary)
-            found = _corners(session, step.captures[0], spec, noise, flat, rules)
+            found = _corners(session, step.captures[0], spec, noise, flat)
             views.append(BoardView(step.id, spec, board.parallel_to_panel, *found))
-    return GeometryData(tuple(views), nominal, shape[::-1], rig_prior(rig, rules))
+    return GeometryData(tuple(views), nominal, shape[::-1], rig_prior(rig))
 
 
-def rig_prior(rig: RigDescription, rules: GeometryRules = USUAL) -> Prior:
-    """Prior on the intrinsics, in their order, from a rig's description.
-
-    The focal length's tolerance is its sigma; ``rules`` have those of principal point and distortion.
-    """
+def rig_prior(rig: RigDescription) -> Prior:
+    """Prior on the intrinsics, in their order, from a rig's description: the focal length's sigma is its tolerance."""
     focal = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
-    sigma = [*[focal] * 2, *[rules.centre_sigma * rig.camera.columns] * 2, *rules.distortion_sigma]
+    sigma = [*[focal] * 2, *[RULES.centre_sigma * rig.camera.columns] * 2, *RULES.distortion_sigma]
     return Prior.independent(intrinsics_of(nominal_geometry(rig)), np.array(sigma))
 
 
@@ -118,7 +115,6 @@ def flat_field(
     light: Float[np.ndarray, "rows columns"],
     variance: Float[np.ndarray, "rows columns"],
     unclipped: Bool[np.ndarray, "rows columns"],
-    rules: GeometryRules = USUAL,
 ) -> FlatField:
     """Response of a sensor to an even field; clipped, dead and covered samples have a response of 1.
 
@@ -127,14 +123,14 @@ def flat_field(
     response, relative = np.ones_like(light), np.zeros_like(light)
     for site in cfa_named("RGGB").sites:  # Any pattern of 2 x 2 has these sites.
         own = light[site.samples] / max(float(light[site.samples].mean()), 1e-12)
-        good = unclipped[site.samples] & (own > rules.least_response)
+        good = unclipped[site.samples] & (own > RULES.least_response)
         response[site.samples][good] = own[good]
         relative[site.samples][good] = variance[site.samples][good] / light[site.samples][good] ** 2
     return FlatField(response, relative)
 
 
 def _corners(
-    session: Session, capture: StoredCapture, spec: BoardSpec, noise: Noise, flat: FlatField, rules: GeometryRules
+    session: Session, capture: StoredCapture, spec: BoardSpec, noise: Noise, flat: FlatField
 ) -> tuple[BoardCorners, float]:
     """The board in a capture (an average, or a single frame), and the part of its samples that are clipped."""
     mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
@@ -149,9 +145,8 @@ def _corners(
     # The picture as equal pixels would see it; the remaining inequality adds to the temporal noise.
     even = light / flat.response[part]
     spread = variance / flat.response[part] ** 2 + flat.relative_variance[part] * even**2
-    found = detect_corners(luminance(even, spread), spec, rules)
-    placed = BoardCorners(found.ids, found.xy + np.array([area.x, area.y], dtype=np.float64), found.sigma)
-    return placed, float(np.mean(mean >= rules.clipped * top))
+    found = detect_corners(luminance(even, spread), spec)
+    return replace(found, xy=found.xy + np.array([area.x, area.y])), float(np.mean(mean >= RULES.clipped * top))
 
 
 @final
@@ -169,7 +164,6 @@ def gather(
     board: Sequence[np.ndarray],
     image: Sequence[np.ndarray],
     sigmas: Sequence[np.ndarray] | None = None,
-    rules: GeometryRules = USUAL,
 ) -> Gathered:
     """Every finite point of every view that determines a pose; arguments and errors as for ``fit_geometry``."""
     for given in (board, image) if sigmas is None else (board, image, sigmas):
@@ -200,7 +194,7 @@ def gather(
         good = np.isfinite(whole).all(axis=1) & (own > 0)
         lost += [f"view {number}, point {k}" for k in np.flatnonzero(~good)]
         part = (whole[good, :3], whole[good, 3:5], own[good], np.flatnonzero(good))
-        if complaint := _complaint(part[0], part[1], list(parts.values()), rules):
+        if complaint := _complaint(part[0], part[1], list(parts.values())):
             notes.append(f"View {number} is left out: {complaint}")
         else:
             parts[number] = part
@@ -211,9 +205,9 @@ def gather(
     return Gathered(found, left_out, tuple(notes), sigmas is not None)
 
 
-def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarray, ...]], rules: GeometryRules) -> str:
+def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarray, ...]]) -> str:
     """Why a view cannot be used; empty when it can."""
-    least = rules.least_corners
+    least = RULES.least_corners
     if len(board) < least:
         return f"expected at least {least} points, found {len(board)}. Bring more of the board into the picture."
     for points, what in ((board, "on the board"), (image, "in the picture")):

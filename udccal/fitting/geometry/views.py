@@ -24,10 +24,9 @@ from udccal.fitting.geometry.bundle import (
     EVERY,
     NOTHING_KNOWN,
     ORDERS,
-    USUAL,
+    RULES,
     Bundle,
     BundleProblem,
-    GeometryRules,
     Points,
     Solved,
     centred,
@@ -54,33 +53,32 @@ def calibrate_views(
     start: Geometry | None = None,
     prior: Prior | None = None,
     start_poses: Float[np.ndarray, "views 6"] | None = None,
-    rules: GeometryRules = USUAL,
 ) -> CalibratedViews:
     """Lens and poses with their covariance, and tests of them; ``fit_geometry`` makes the term of these.
 
     Args:
         gathered: the points, from ``gather``.
         image_size: (columns, rows).
-        start, prior, rules: as for ``fit_geometry``.
+        start, prior: as for ``fit_geometry``.
         start_poses: per view, a pose to start from, with ``start``; see ``bundle.Bundle``.
 
     Raises:
         FitError: with fewer than 3 usable views (1 with a prior).
     """
     check_picture(image_size, gathered.points)
-    least, known = (rules.least_views, NOTHING_KNOWN) if prior is None else (1, prior)
+    least, known = (RULES.least_views, NOTHING_KNOWN) if prior is None else (1, prior)
     given, left_out = gathered.points, gathered.outliers
     if len(given.names) < least:
         found = f"{len(given.names) + len(gathered.notes)} views, {len(given.names)} of them usable"
         raise FitError(
-            f"Expected at least {least} views of at least {rules.least_corners} points each, found {found}. "
+            f"Expected at least {least} views of at least {RULES.least_corners} points each, found {found}. "
             f"{' '.join(gathered.notes)} Capture more views of the board."
         )
-    robust = _Search(given, known, rules).best_of(starts(given, image_size, start, start_poses))
-    scatters = f"scatters more than {rules.strange_view:g} times as much as the median view"
+    robust = _Search(given, known).best_of(starts(given, image_size, start, start_poses))
+    scatters = f"scatters more than {RULES.strange_view:g} times as much as the median view"
     repeats = "repeats another's corners to within a fraction of their scatter: it is no new measurement"
     for rule, what in ((_strange, scatters), (_copies, repeats)):
-        out = rule(robust, rules, least)
+        out = rule(robust, least)
         if out.any():
             names = (f"view {given.names[k]}" for k in np.flatnonzero(out))
             left_out = (*left_out, *outliers(f"of a view that {what}", names))
@@ -90,14 +88,14 @@ def calibrate_views(
                     f"Expected at least {least} different views, found {len(given.names)}, and {int(out.sum())} that "
                     "repeat them. Move the board between pictures."
                 )
-            robust = _Search(given, known, rules).best_of(starts(given, image_size, start, start_poses))
+            robust = _Search(given, known).best_of(starts(given, image_size, start, start_poses))
     likely = _scaled(robust, replace(given, used=robust.points.used), EVERY, known)
-    orders, between = _choose_order(likely, known, rules)
+    orders, between = _choose_order(likely, known)
     free = ORDERS[orders.best.name]
     final = _scaled(replace(likely, solved=orders.best.fit), likely.points, free, known)
     points, solved, bundle = final.points, final.solved, final.solved.place.facing()
     disagree, cov = disagreement(solved, points, free, final.dof)
-    pattern, pattern_px = residual_pattern(solved, points, image_size, final.dof, rules.pattern_cells)
+    pattern, pattern_px = residual_pattern(solved, points, image_size, final.dof, RULES.pattern_cells)
     places = (f"view {points.names[points.view[k]]}, point {points.index[k]}" for k in np.flatnonzero(~points.used))
     views = CalibratedViews(
         intrinsics=bundle.intrinsics,
@@ -113,11 +111,11 @@ def calibrate_views(
         pattern_px=pattern_px,
         status=FitStatus.CONVERGED if solved.converged else FitStatus.NOT_CONVERGED,
         notes=gathered.notes,
-        outliers=(*left_out, *rules.corners.listed(places)),
+        outliers=(*left_out, *RULES.corners.listed(places)),
         iterations=likely.solved.iterations,
         image_size=image_size,
     )
-    return judged(views, likely.scales, between is None, rules)
+    return judged(views, likely.scales, between is None)
 
 
 def starts(
@@ -162,7 +160,6 @@ class _Search:
 
     given: Points
     known: Prior
-    rules: GeometryRules
 
     def best_of(self, begun: list[Bundle]) -> _Fitted:
         """The best minimum of all starts; these may leave out different points: the spread of all compares them."""
@@ -183,7 +180,7 @@ class _Search:
         """Descend robustly and with few coefficients first: from far off, all five may lead to a wrong minimum."""
         for free in (ORDERS["k1"], EVERY):
             scaled = self.given.scaled(self._judged(bundle, self.given.used)[0])
-            bundle = solve(bundle, scaled, free, self.known, self.rules.robust).place.facing()
+            bundle = solve(bundle, scaled, free, self.known, RULES.robust).place.facing()
         return self._without_outliers(bundle)
 
     def _without_outliers(self, place: Bundle) -> _Fitted:
@@ -210,8 +207,8 @@ class _Search:
         seen = np.where(used[:, None], z, np.nan)
         own = np.array([robust_sigma(seen[view == k]) for k in range(views)])
         scales = np.maximum(np.maximum(own, 0.5 * robust_sigma(seen)), _least_scale(self.given))
-        off = self.rules.corners.off(z / scales[view, None]).any(axis=1)
-        return scales, ~off | (np.bincount(view[~off], minlength=views) < self.rules.least_corners)[view]
+        off = RULES.corners.off(z / scales[view, None]).any(axis=1)
+        return scales, ~off | (np.bincount(view[~off], minlength=views) < RULES.least_corners)[view]
 
 
 def check_picture(image_size: object, points: Points) -> None:
@@ -234,23 +231,23 @@ def check_picture(image_size: object, points: Points) -> None:
         )
 
 
-def _strange(robust: _Fitted, rules: GeometryRules, least: int) -> Bool[np.ndarray, " views"]:
+def _strange(robust: _Fitted, least: int) -> Bool[np.ndarray, " views"]:
     """Views that scatter far more than the others, unless too few would be left."""
-    strange = robust.scales > rules.strange_view * np.median(robust.scales)
+    strange = robust.scales > RULES.strange_view * np.median(robust.scales)
     return np.asarray(strange & bool((~strange).sum() >= least))
 
 
-def _copies(robust: _Fitted, rules: GeometryRules, _: int) -> Bool[np.ndarray, " views"]:
+def _copies(robust: _Fitted, _: int) -> Bool[np.ndarray, " views"]:
     """Views that repeat an earlier one: the errors of a picture that is given twice are no independent ones."""
     points, views = robust.points, range(len(robust.points.names))
     used = [np.flatnonzero((points.view == view) & points.used) for view in views]
     corners, copies = [{tuple(points.board[k]): k for k in mine} for mine in used], np.zeros(len(views), dtype=bool)
     for first, later in combinations(views, 2):
         common = corners[first].keys() & corners[later].keys()
-        if not copies[first] and len(common) >= rules.least_corners:
+        if not copies[first] and len(common) >= RULES.least_corners:
             a, b = np.array([(corners[first][at], corners[later][at]) for at in common]).T
             apart2 = ((points.image[a] - points.image[b]) ** 2).mean(axis=1).sum()
-            copies[later] |= apart2 < rules.copy * (points.sigma[[a, b]] ** 2).sum()
+            copies[later] |= apart2 < RULES.copy * (points.sigma[[a, b]] ** 2).sum()
     return copies
 
 
@@ -300,9 +297,7 @@ def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"
     return chi2_test(ratio / correction, len(dof) - 1.0).found
 
 
-def _choose_order(
-    full: _Fitted, prior: Prior, rules: GeometryRules
-) -> tuple[Choice[Solved], Float[np.ndarray, "n n"] | None]:
+def _choose_order(full: _Fitted, prior: Prior) -> tuple[Choice[Solved], Float[np.ndarray, "n n"] | None]:
     """Every order, each solved from the one before with other coefficients at 0, and what the choice adds to cov.
 
     Where a large part of the information on focal length or centre is the prior's, the data are too few to separate a
@@ -316,7 +311,7 @@ def _choose_order(
     # p1 and p2 come together, at the price of one.
     pair = np.array(["p1 p2" in name for name in ORDERS])
     coefficients = np.array([free.sum() for free in ORDERS.values()]) - ORDERS["no distortion"].sum()
-    against = 2 * np.log(rules.further_order) * (coefficients - pair)
+    against = 2 * np.log(RULES.further_order) * (coefficients - pair)
     for price, (name, free) in reversed(list(zip(against, ORDERS.items(), strict=True))):
         if tried:
             above = Bundle(np.where(free, solved.place.intrinsics, 0.0), solved.place.poses)
@@ -326,7 +321,7 @@ def _choose_order(
         criterion = bic(samples * float(np.log(noise)), float(parameters), samples) + float(price)
         tried.insert(0, Attempt(name, parameters, criterion, solved))
     known = np.diag(full.solved.equations.cov()) * np.diag(prior.precision)
-    if known[:4].max() > rules.prior_share:
+    if known[:4].max() > RULES.prior_share:
         return Choice(tried[-1], tuple(tried)), None
     orders = choose(tried)
     # Akaike's price of p1 and p2 is that of one, too: with that of both, a pair that is there has too little weight.
