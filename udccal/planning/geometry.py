@@ -171,7 +171,7 @@ class GeometryPredictor:
         points = points.scaled(np.array([1.0 if view.parallel else count**-0.5 for view in views]))
         bundle = Bundle(self._intrinsics, np.array([view.pose for view in views]))
         problem = BundleProblem(points, self._order(points, bundle), self._prior)
-        x, cov = with_angles(bundle.intrinsics, bundle.poses, problem.equations_at(bundle).joint_cov(), parallel)
+        x, cov = with_angles(bundle, problem.equations_at(bundle).joint_cov(), parallel)
         posterior = Posterior.from_cov(x, cov, functools.partial(term_at, pupil=self._state.geometry.pupil_mm))
         sigma = projection_sigma_px(posterior, sensor_samples(self._state.rig, _ACROSS))
         return float(np.sqrt((sigma**2).mean()))

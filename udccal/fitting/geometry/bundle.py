@@ -28,6 +28,10 @@ ORDERS = {
     for name in ("no distortion", "k1", "k1 k2", "k1 k2 k3", "k1 k2 p1 p2", "k1 k2 p1 p2 k3")
 }
 EVERY = np.ones(LENS, dtype=bool)
+Intrinsics = Float[np.ndarray, "9"]
+Free = Bool[np.ndarray, "9"]
+# Of each view, board to camera: rotation vector (rad), then translation (board's unit).
+Poses = Float[np.ndarray, "views 6"]
 NOTHING_KNOWN = Prior(np.zeros(LENS), np.zeros((0, LENS)))
 
 
@@ -40,11 +44,6 @@ class GeometryRules:
         least_views: usable views that may determine a lens; with a prior, one determines at least its pose.
         least_corners: of a usable view. Four determine a homography; two more test it.
         most_clipped: part of a board's samples at saturation. Beyond it edges have bloomed.
-        clipped: samples from this part of saturation on count as clipped.
-        least_response: samples with less than this part of the flat field are dead, or behind an opaque row.
-        centre_sigma: prior sigma of the principal point about the sensor's middle, as part of the width.
-        distortion_sigma: prior sigma of (k1, k2, p1, p2, k3).
-        robust: loss of the residuals in descents from a start that may be far off.
         corners: which corners are left out, by their view's own scatter.
         strange_view: a view is left out whole when it scatters this many times as much as the median view.
         loud_view: a view is mentioned when it scatters this many times as much.
@@ -59,8 +58,7 @@ class GeometryRules:
         no_corners_px: RMS residual beyond which the fit is poor whatever the sigmas: any corner detector comes closer.
         pattern_cells: cells along a side of the grid over which residuals are averaged.
         start_scatter_px: scatter of corners in addition to noise, before it is estimated.
-        marker_margin, window_squares: radius of a corner's window, of the distance to the markers and of a square.
-        window_px: least and largest radius.
+        window_px: least and largest radius of a corner's window.
         least_contrast: half the step at a corner over the saddle's residuals.
         worst_corner_sigma_px: largest sigma of a corner by noise.
     """
@@ -68,11 +66,6 @@ class GeometryRules:
     least_views: int = 3
     least_corners: int = 6
     most_clipped: float = 0.02
-    clipped: float = 0.995
-    least_response: float = 0.05
-    centre_sigma: float = 0.01
-    distortion_sigma: tuple[float, ...] = (0.2, 0.2, 1e-3, 1e-3, 0.1)
-    robust: Cauchy = field(default_factory=Cauchy)
     corners: OutlierRule = field(default_factory=lambda: OutlierRule("corners"))
     strange_view: float = 20.0
     loud_view: float = 3.0
@@ -85,8 +78,6 @@ class GeometryRules:
     no_corners_px: float = 5.0
     pattern_cells: int = 6
     start_scatter_px: float = 0.02
-    marker_margin: float = 0.9
-    window_squares: float = 0.4
     window_px: tuple[float, float] = (4.0, 25.0)
     least_contrast: float = 6.0
     worst_corner_sigma_px: float = 1.0
@@ -95,12 +86,12 @@ class GeometryRules:
 RULES: Final = GeometryRules()
 
 
-def intrinsics_of(geometry: Geometry) -> Float[np.ndarray, "9"]:
+def intrinsics_of(geometry: Geometry) -> Intrinsics:
     """Intrinsics of a fitted or nominal term as a vector, in the order of ``INTRINSIC_NAMES``."""
     return np.concatenate([geometry.focal_px, geometry.principal_point_px, geometry.distortion], dtype=np.float64)
 
 
-def centred(focal_px: float, image_size: tuple[int, int]) -> Float[np.ndarray, "9"]:
+def centred(focal_px: float, image_size: tuple[int, int]) -> Intrinsics:
     """Intrinsics without distortion, about the middle of the picture of (columns, rows)."""
     return np.concatenate([np.full(2, focal_px), (np.array(image_size) - 1) / 2, np.zeros(5)])
 
@@ -110,7 +101,7 @@ def lens_alone(intrinsics: Float[Arrayish, " n"]) -> Geometry:
     return Geometry(intrinsics[:2], intrinsics[2:4], intrinsics[4:LENS], np.zeros(3), np.zeros(3))
 
 
-def camera_matrix(intrinsics: Float[np.ndarray, "9"]) -> Float[np.ndarray, "3 3"]:
+def camera_matrix(intrinsics: Intrinsics) -> Float[np.ndarray, "3 3"]:
     """OpenCV's camera matrix."""
     fx, fy, cx, cy = intrinsics[:4]
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -119,10 +110,10 @@ def camera_matrix(intrinsics: Float[np.ndarray, "9"]) -> Float[np.ndarray, "3 3"
 @final
 @dataclass(frozen=True)
 class Bundle:
-    """Intrinsics and one pose per view, board to camera: rotation vector (rad), then translation (board's unit)."""
+    """Intrinsics and one pose per view."""
 
-    intrinsics: Float[np.ndarray, "9"]
-    poses: Float[np.ndarray, "views 6"]
+    intrinsics: Intrinsics
+    poses: Poses
 
     def facing(self) -> Bundle:
         """The same pictures with every board in front of the camera, and rotations of at most half a turn.
@@ -173,7 +164,7 @@ class Points:
 
 
 def projected(
-    intrinsics: Float[np.ndarray, "9"], camera: Float[np.ndarray, "n 3"]
+    intrinsics: Intrinsics, camera: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 15"]]:
     """Places of points in camera coordinates (any unit), in px (``cv2.projectPoints``).
 
@@ -215,7 +206,7 @@ class BundleProblem:
     """
 
     points: Points
-    free: Bool[np.ndarray, "9"]
+    free: Free
     prior: Prior = NOTHING_KNOWN
     robust: Cauchy | None = None
 
@@ -257,11 +248,7 @@ Solved = Solution[Bundle, Blocks]
 
 
 def solve(
-    start: Bundle,
-    points: Points,
-    free: Bool[np.ndarray, "9"],
-    prior: Prior = NOTHING_KNOWN,
-    robust: Cauchy | None = None,
+    start: Bundle, points: Points, free: Free, prior: Prior = NOTHING_KNOWN, robust: Cauchy | None = None
 ) -> Solved:
     """The minimum next to ``start``, to a thousandth of a sigma or, where robust, a tenth: another descent follows."""
     rules = SolverRules(least_gain=1e-6 if robust is None else 1e-2)

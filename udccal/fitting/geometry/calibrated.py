@@ -15,7 +15,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from udccal.errors import FitError
 from udccal.fitting.engine.misfit import MisfitTest, clustered_cov, f_test
@@ -23,7 +23,10 @@ from udccal.fitting.geometry.bundle import (
     LENS,
     RULES,
     BundleProblem,
+    Free,
+    Intrinsics,
     Points,
+    Poses,
     Solved,
     camera_matrix,
     in_sigma,
@@ -65,8 +68,8 @@ class CalibratedViews:
         iterations: of the last solve with all distortions free.
     """
 
-    intrinsics: Float[np.ndarray, "9"]
-    poses: Float[np.ndarray, "views 6"]
+    intrinsics: Intrinsics
+    poses: Poses
     cov: Float[np.ndarray, "n n"]
     points: Points
     residuals_px: Float[np.ndarray, "points 2"]
@@ -116,10 +119,8 @@ class CalibratedViews:
         self, pixels: Float[np.ndarray, "rays 2"]
     ) -> tuple[Float[np.ndarray, "rays 2 9"], Float[np.ndarray, "rays 2 3"]]:
         """Derivatives of the places where rays land, by the intrinsics and by a small rotation of the rays."""
-        lens, enough = (
-            (camera_matrix(self.intrinsics), self.intrinsics[4:]),
-            (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-9),
-        )
+        lens = camera_matrix(self.intrinsics), self.intrinsics[4:]
+        enough = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-9
         ideal = cv2.undistortPoints(pixels, *lens, criteria=enough)
         places, by = projected(self.intrinsics, cv2.convertPointsToHomogeneous(ideal).reshape(-1, 3))
         near = np.abs(places - pixels).max(axis=1) < 1e-6
@@ -141,7 +142,7 @@ def field_grid(image_size: tuple[int, int]) -> Float[np.ndarray, "81 2"]:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def turn_with(poses: Float[np.ndarray, "views 6"], views: Sequence[int]) -> Float[np.ndarray, "3 n"]:
+def turn_with(poses: Poses, views: Sequence[int]) -> Float[np.ndarray, "3 n"]:
     """Derivatives, by intrinsics and all poses, of the mean rotation of some views' boards in camera coordinates.
 
     It is the small rotation that follows the old one; the left Jacobian of SO(3) takes the rotation vectors to it.
@@ -155,9 +156,7 @@ def turn_with(poses: Float[np.ndarray, "views 6"], views: Sequence[int]) -> Floa
     return turn
 
 
-def disagreement(
-    solved: Solved, points: Points, free: Bool[np.ndarray, "9"], dof: float
-) -> tuple[MisfitTest, Float[np.ndarray, "n n"]]:
+def disagreement(solved: Solved, points: Points, free: Free, dof: float) -> tuple[MisfitTest, Float[np.ndarray, "n n"]]:
     """Test of the lenses that each view prefers, and a covariance that is wider where they disagree.
 
     The lens then has the spread that it has when one view after another is left out, and the poses follow. Its 95 %
@@ -181,16 +180,14 @@ def disagreement(
     return test, solved.equations.joint_cov(lens, test.inflation)
 
 
-def residual_pattern(
-    solved: Solved, points: Points, image_size: tuple[int, int], dof: float, cells: int
-) -> tuple[MisfitTest, float]:
+def residual_pattern(solved: Solved, points: Points, size: tuple[int, int], dof: float) -> tuple[MisfitTest, float]:
     """Test of sums over the cells of a grid by their covariance under the model, and the size in px of what it found.
 
     ``group_means_test`` does not serve here: the fit absorbs most of a smooth pattern, so that means of cells scatter
     far less than those of independent residuals. The covariance of the sums accounts for that.
     """
-    z, jacobian = in_sigma(solved.place, points)
-    place = np.clip(points.image / np.array(image_size) * cells, 0, cells - 1).astype(np.int64)
+    (z, jacobian), cells = in_sigma(solved.place, points), RULES.pattern_cells
+    place = np.clip(points.image / np.array(size) * cells, 0, cells - 1).astype(np.int64)
     cell = place[:, 1] * cells + place[:, 0]
     inside = np.equal.outer(np.unique(cell[points.used]), cell) * points.used.astype(np.float64)
     count, sums = np.repeat(inside.sum(axis=1), 2), (inside @ z).ravel()

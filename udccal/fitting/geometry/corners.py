@@ -25,17 +25,19 @@ from udccal.board.charuco import board_points_mm, charuco_board
 from udccal.cfa import cfa_named
 from udccal.fitting.geometry.bundle import RULES
 
+Picture = Float[np.ndarray, "rows columns"]
+
 
 @final
 @dataclass(frozen=True)
 class Luminance:
     """Grey picture of a black-and-white subject; ``variance`` is that of its samples before they were filtered."""
 
-    grey: Float[np.ndarray, "rows columns"]
-    variance: Float[np.ndarray, "rows columns"]
+    grey: Picture
+    variance: Picture
 
 
-def luminance(mosaic: Float[np.ndarray, "rows columns"], variance: Float[np.ndarray, "rows columns"]) -> Luminance:
+def luminance(mosaic: Picture, variance: Picture) -> Luminance:
     """Grey picture on the mosaic's own pixels, whose black level is subtracted; ``variance`` is of single samples.
 
     The four sites of the pattern are scaled to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16. It gives
@@ -74,10 +76,9 @@ def detect_corners(picture: Luminance, spec: BoardSpec) -> BoardCorners:
     if len(ids) < RULES.least_corners:
         return BoardCorners(ids[:0], rough[:0], np.zeros(0))
     edges = _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
-    # Of a square: the distance from a corner to the markers.
-    margin = RULES.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
-    side = np.linalg.norm(edges, axis=2).min(axis=1)
-    radius = np.clip(min(margin, RULES.window_squares) * side, *RULES.window_px)
+    # The window, of a square: clear of the markers, and of the next corners.
+    reach = min(0.9 * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm), 0.4)
+    radius = np.clip(reach * np.linalg.norm(edges, axis=2).min(axis=1), *RULES.window_px)
     half = int(np.ceil(radius.max())) + 1
     base = np.clip(np.round(rough).astype(np.int64), half, np.array(picture.grey.shape[::-1]) - half - 1)
     dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
@@ -94,9 +95,7 @@ def detect_corners(picture: Luminance, spec: BoardSpec) -> BoardCorners:
     return BoardCorners(ids[good], xy[good], sigma[good])
 
 
-def _detect(
-    grey: Float[np.ndarray, "rows columns"], spec: BoardSpec
-) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
+def _detect(grey: Picture, spec: BoardSpec) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
     """OpenCV's detection on the picture and, for strong blur, on one of half its size; the one with more corners."""
     low, high = np.percentile(grey, [0.5, 99.5])
     picture = np.round(255.0 * np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0)).astype(np.uint8)

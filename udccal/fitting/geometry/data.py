@@ -14,7 +14,7 @@ from typing import final
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from udccal.arguments import found_instead
 from udccal.arrangements import BoardSpec
@@ -22,8 +22,8 @@ from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.geometry.bundle import RULES, Points, camera_matrix, intrinsics_of
-from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance
+from udccal.fitting.geometry.bundle import RULES, Intrinsics, Points, Poses, camera_matrix, intrinsics_of
+from udccal.fitting.geometry.corners import BoardCorners, Picture, detect_corners, luminance
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.wire.data import read_wire
 from udccal.models.geometry import Geometry
@@ -96,9 +96,12 @@ def read_geometry(session: Session, noise: Noise) -> GeometryData:
 
 
 def rig_prior(rig: RigDescription) -> Prior:
-    """Prior on the intrinsics, in their order, from a rig's description: the focal length's sigma is its tolerance."""
+    """Prior on the intrinsics, in their order, from a rig's description.
+
+    The focal length's sigma is its tolerance. Centres lie within some per cent of the width; distortion is moderate.
+    """
     focal = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
-    sigma = [*[focal] * 2, *[RULES.centre_sigma * rig.camera.columns] * 2, *RULES.distortion_sigma]
+    sigma = [*[focal] * 2, *[0.01 * rig.camera.columns] * 2, 0.2, 0.2, 1e-3, 1e-3, 0.1]
     return Prior.independent(intrinsics_of(nominal_geometry(rig)), np.array(sigma))
 
 
@@ -107,15 +110,11 @@ def rig_prior(rig: RigDescription) -> Prior:
 class FlatField:
     """Response of every sample over the mean of its CFA site, and the relative variance of that by noise."""
 
-    response: Float[np.ndarray, "rows columns"]
-    relative_variance: Float[np.ndarray, "rows columns"]
+    response: Picture
+    relative_variance: Picture
 
 
-def flat_field(
-    light: Float[np.ndarray, "rows columns"],
-    variance: Float[np.ndarray, "rows columns"],
-    unclipped: Bool[np.ndarray, "rows columns"],
-) -> FlatField:
+def flat_field(light: Picture, variance: Picture, unclipped: Bool[np.ndarray, "rows columns"]) -> FlatField:
     """Response of a sensor to an even field; clipped, dead and covered samples have a response of 1.
 
     ``light`` has any linear unit, its black level subtracted; ``variance`` is its own, in that unit squared.
@@ -123,7 +122,8 @@ def flat_field(
     response, relative = np.ones_like(light), np.zeros_like(light)
     for site in cfa_named("RGGB").sites:  # Any pattern of 2 x 2 has these sites.
         own = light[site.samples] / max(float(light[site.samples].mean()), 1e-12)
-        good = unclipped[site.samples] & (own > RULES.least_response)
+        # Samples with less are dead, or behind an opaque row.
+        good = unclipped[site.samples] & (own > 0.05)
         response[site.samples][good] = own[good]
         relative[site.samples][good] = variance[site.samples][good] / light[site.samples][good] ** 2
     return FlatField(response, relative)
@@ -146,7 +146,7 @@ def _corners(
     even = light / flat.response[part]
     spread = variance / flat.response[part] ** 2 + flat.relative_variance[part] * even**2
     found = detect_corners(luminance(even, spread), spec)
-    return replace(found, xy=found.xy + np.array([area.x, area.y])), float(np.mean(mean >= RULES.clipped * top))
+    return replace(found, xy=found.xy + np.array([area.x, area.y])), float(np.mean(mean >= 0.995 * top))
 
 
 @final
@@ -161,9 +161,7 @@ class Gathered:
 
 
 def gather(
-    board: Sequence[np.ndarray],
-    image: Sequence[np.ndarray],
-    sigmas: Sequence[np.ndarray] | None = None,
+    board: Sequence[np.ndarray], image: Sequence[np.ndarray], sigmas: Sequence[np.ndarray] | None = None
 ) -> Gathered:
     """Every finite point of every view that determines a pose; arguments and errors as for ``fit_geometry``."""
     for given in (board, image) if sigmas is None else (board, image, sigmas):
@@ -221,9 +219,7 @@ def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarr
     return ""
 
 
-def best_poses(
-    points: Points, intrinsics: Float[np.ndarray, "9"]
-) -> tuple[Float[np.ndarray, "views 6"], Float[np.ndarray, "views 6"]]:
+def best_poses(points: Points, intrinsics: Intrinsics) -> tuple[Poses, Poses]:
     """The best pose of each view at these intrinsics, and the one mirrored at the line of sight."""
     lens = camera_matrix(intrinsics), intrinsics[4:]
     pairs = np.array([_pose_pair(points, view, *lens) for view in range(len(points.names))]).reshape(-1, 2, 6)

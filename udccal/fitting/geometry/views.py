@@ -7,6 +7,7 @@ is estimated. All views have one scale unless a test finds that they differ (by 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import final
@@ -19,7 +20,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.misfit import chi2_test
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
-from udccal.fitting.engine.robust import outliers, robust_sigma
+from udccal.fitting.engine.robust import Cauchy, outliers, robust_sigma
 from udccal.fitting.geometry.bundle import (
     EVERY,
     NOTHING_KNOWN,
@@ -27,7 +28,9 @@ from udccal.fitting.geometry.bundle import (
     RULES,
     Bundle,
     BundleProblem,
+    Free,
     Points,
+    Poses,
     Solved,
     centred,
     intrinsics_of,
@@ -38,7 +41,7 @@ from udccal.fitting.geometry.calibrated import CalibratedViews, disagreement, ju
 from udccal.fitting.geometry.data import Gathered, best_poses
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
-from udccal.result import FitStatus
+from udccal.result import FitStatus, Outliers
 
 # A detector finds corners up to so far beyond the centres of the outermost pixels.
 _BESIDE_PX = 1.0
@@ -52,7 +55,7 @@ def calibrate_views(
     image_size: tuple[int, int],
     start: Geometry | None = None,
     prior: Prior | None = None,
-    start_poses: Float[np.ndarray, "views 6"] | None = None,
+    start_poses: Poses | None = None,
 ) -> CalibratedViews:
     """Lens and poses with their covariance, and tests of them; ``fit_geometry`` makes the term of these.
 
@@ -67,35 +70,23 @@ def calibrate_views(
     """
     check_picture(image_size, gathered.points)
     least, known = (RULES.least_views, NOTHING_KNOWN) if prior is None else (1, prior)
-    given, left_out = gathered.points, gathered.outliers
+    given = gathered.points
     if len(given.names) < least:
         found = f"{len(given.names) + len(gathered.notes)} views, {len(given.names)} of them usable"
         raise FitError(
             f"Expected at least {least} views of at least {RULES.least_corners} points each, found {found}. "
             f"{' '.join(gathered.notes)} Capture more views of the board."
         )
-    robust = _Search(given, known).best_of(starts(given, image_size, start, start_poses))
-    scatters = f"scatters more than {RULES.strange_view:g} times as much as the median view"
-    repeats = "repeats another's corners to within a fraction of their scatter: it is no new measurement"
-    for rule, what in ((_strange, scatters), (_copies, repeats)):
-        out = rule(robust, least)
-        if out.any():
-            names = (f"view {given.names[k]}" for k in np.flatnonzero(out))
-            left_out = (*left_out, *outliers(f"of a view that {what}", names))
-            given = given.without(out)
-            if len(given.names) < least:
-                raise FitError(
-                    f"Expected at least {least} different views, found {len(given.names)}, and {int(out.sum())} that "
-                    "repeat them. Move the board between pictures."
-                )
-            robust = _Search(given, known).best_of(starts(given, image_size, start, start_poses))
+    robust, given, strange = _distinct(
+        given, least, lambda points: _Search(points, known).best_of(starts(points, image_size, start, start_poses))
+    )
     likely = _scaled(robust, replace(given, used=robust.points.used), EVERY, known)
     orders, between = _choose_order(likely, known)
     free = ORDERS[orders.best.name]
     final = _scaled(replace(likely, solved=orders.best.fit), likely.points, free, known)
     points, solved, bundle = final.points, final.solved, final.solved.place.facing()
     disagree, cov = disagreement(solved, points, free, final.dof)
-    pattern, pattern_px = residual_pattern(solved, points, image_size, final.dof, RULES.pattern_cells)
+    pattern, pattern_px = residual_pattern(solved, points, image_size, final.dof)
     places = (f"view {points.names[points.view[k]]}, point {points.index[k]}" for k in np.flatnonzero(~points.used))
     views = CalibratedViews(
         intrinsics=bundle.intrinsics,
@@ -111,16 +102,14 @@ def calibrate_views(
         pattern_px=pattern_px,
         status=FitStatus.CONVERGED if solved.converged else FitStatus.NOT_CONVERGED,
         notes=gathered.notes,
-        outliers=(*left_out, *RULES.corners.listed(places)),
+        outliers=(*gathered.outliers, *strange, *RULES.corners.listed(places)),
         iterations=likely.solved.iterations,
         image_size=image_size,
     )
     return judged(views, likely.scales, between is None)
 
 
-def starts(
-    points: Points, size: tuple[int, int], given: Geometry | None, poses: Float[np.ndarray, "views 6"] | None
-) -> list[Bundle]:
+def starts(points: Points, size: tuple[int, int], given: Geometry | None, poses: Poses | None) -> list[Bundle]:
     """Starts: from the given intrinsics, and from the views' vanishing points or else a common lens."""
     lenses = [] if given is None else [intrinsics_of(given)]
     lenses.append(centred(_focal_px(points, size), size))
@@ -180,7 +169,7 @@ class _Search:
         """Descend robustly and with few coefficients first: from far off, all five may lead to a wrong minimum."""
         for free in (ORDERS["k1"], EVERY):
             scaled = self.given.scaled(self._judged(bundle, self.given.used)[0])
-            bundle = solve(bundle, scaled, free, self.known, RULES.robust).place.facing()
+            bundle = solve(bundle, scaled, free, self.known, Cauchy()).place.facing()
         return self._without_outliers(bundle)
 
     def _without_outliers(self, place: Bundle) -> _Fitted:
@@ -231,6 +220,28 @@ def check_picture(image_size: object, points: Points) -> None:
         )
 
 
+def _distinct(
+    given: Points, least: int, search: Callable[[Points], _Fitted]
+) -> tuple[_Fitted, Points, tuple[Outliers, ...]]:
+    """The minimum of the views that are measurements of their own, those views, and what was left out."""
+    robust, left_out = search(given), tuple[Outliers, ...]()
+    scatters = f"scatters more than {RULES.strange_view:g} times as much as the median view"
+    repeats = "repeats another's corners to within a fraction of their scatter: it is no new measurement"
+    for rule, what in ((_strange, scatters), (_copies, repeats)):
+        out = rule(robust, least)
+        if out.any():
+            names = (f"view {given.names[k]}" for k in np.flatnonzero(out))
+            left_out = (*left_out, *outliers(f"of a view that {what}", names))
+            given = given.without(out)
+            if len(given.names) < least:
+                raise FitError(
+                    f"Expected at least {least} different views, found {len(given.names)}, and {int(out.sum())} that "
+                    "repeat them. Move the board between pictures."
+                )
+            robust = search(given)
+    return robust, given, left_out
+
+
 def _strange(robust: _Fitted, least: int) -> Bool[np.ndarray, " views"]:
     """Views that scatter far more than the others, unless too few would be left."""
     strange = robust.scales > RULES.strange_view * np.median(robust.scales)
@@ -267,11 +278,8 @@ def _least_scale(points: Points) -> float:
     return 1e-8 / float(np.median(points.sigma))
 
 
-def _scaled(fitted: _Fitted, given: Points, free: Bool[np.ndarray, "9"], prior: Prior) -> _Fitted:
-    """Scales by maximum likelihood, residuals over their degrees of freedom, and the solution with these.
-
-    All views have one scale unless they differ.
-    """
+def _scaled(fitted: _Fitted, given: Points, free: Free, prior: Prior) -> _Fitted:
+    """Scales by maximum likelihood and the solution with these; all views have one scale unless they differ."""
     solved, points, scales = fitted.solved, fitted.points, np.ones(len(given.names))
     for _ in range(8):
         square, dof = _costs(solved.place, given), 2 * given.sums(np.ones(len(given.view)))
