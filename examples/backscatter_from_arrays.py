@@ -9,7 +9,8 @@ import numpy as np
 
 import udccal
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.data import BackscatterData, Binned, visible_crop
+from udccal.fitting.backscatter.data import BackscatterData, Binned
+from udccal.fitting.backscatter.read import visible_crop
 from udccal.models.backscatter import panel_response, response_grid
 
 EXPOSURE_S, SAMPLES, READ_E = 0.05, 256, 3.0

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.effort import FitEffort
-from udccal.fitting.backscatter.data import read_backscatter
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import BackscatterRules
+from udccal.fitting.backscatter.read import read_backscatter
 from udccal.fitting.geometry.data import BoardView, read_geometry
 from udccal.fitting.geometry.fit import fit_boards
 from udccal.fitting.noise.data import read_noise

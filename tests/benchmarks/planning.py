@@ -29,8 +29,8 @@ from udccal.benches.capture import capture
 from udccal.calibration import Calibration, calibrate
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.data import read_backscatter
-from udccal.fitting.backscatter.fit import TermAt, linear_cov
+from udccal.fitting.backscatter.posterior import TermAt, linear_cov
+from udccal.fitting.backscatter.read import read_backscatter
 from udccal.fitting.backscatter.solve import Problem, search
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.forecast import PREDICTORS

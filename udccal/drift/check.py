@@ -17,7 +17,7 @@ from udccal.drift.limits import DriftLimits
 from udccal.drift.moved import moved_backscatter, movement_mm
 from udccal.drift.pose import PoseChange, pose_change
 from udccal.errors import ProfileError, SessionError
-from udccal.fitting.backscatter.data import read_backscatter
+from udccal.fitting.backscatter.read import read_backscatter
 from udccal.fitting.wire.data import read_wire
 from udccal.fitting.wire.fit import unusable_flat
 from udccal.fitting.wire.rules import WireRules

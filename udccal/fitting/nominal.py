@@ -118,18 +118,17 @@ def lacking(session: Session, term: TermName) -> str:
     aims = np.array([(led.x_px, led.y_px) for led in shown if isinstance(led, LedSubject)]).reshape(-1, 2)
     roles = [picture.role for picture in shown if isinstance(picture, PanelSubject)]
     on_jig = any(isinstance(board, BoardSubject) and board.parallel_to_panel for board in shown)
-    once = {
-        "geometry": {"a view of the board on the jig, parallel to the display": on_jig},
-        "wire": {step_id: step_id in captured for step_id in ("wire/flat", "wire/dark")},
-        "backscatter": {"backscatter/white": "white" in roles, "backscatter/dark": darks > 0},
-    }
-    counted = {
+    # What is needed, how many there are, and how many are needed.
+    needed: dict[TermName, list[tuple[str, int, int]]] = {
         "noise": [("exposures of the even light", flats, NoiseRules().levels), ("exposures in the dark", darks, 2)],
+        "geometry": [("a view of the board on the jig, parallel to the display", on_jig, 1)],
+        "wire": [(step_id, step_id in captured, 1) for step_id in ("wire/flat", "wire/dark")],
         "psf": [("places of the LED", len(set(group(aims))), PsfRules().least_positions)],
         "backscatter": [
-            ("pictures beside the white one", len(roles) - roles.count("white"), BackscatterRules().fewest_pictures)
+            ("backscatter/white", "white" in roles, 1),
+            ("backscatter/dark", darks, 1),
+            ("pictures beside the white one", len(roles) - roles.count("white"), BackscatterRules().fewest_pictures),
         ],
     }
-    missing = [what for what, there in once.get(term, {}).items() if not there]
-    missing += [f"{least - seen} more {what}" for what, seen, least in counted.get(term, []) if seen < least]
-    return ", ".join(missing)
+    few = [one for one in needed[term] if one[1] < one[2]]
+    return ", ".join(what if least == 1 else f"{least - seen} more {what}" for what, seen, least in few)

@@ -24,18 +24,19 @@ from tests.scenes.backscatter import (
     small_rig,
     world,
 )
-from udccal.fitting.backscatter.data import BackscatterData, grid_rays
-from udccal.fitting.backscatter.fit import TermAt, result_of
+from udccal.fitting.backscatter.data import BackscatterData
+from udccal.fitting.backscatter.fit import result_of
 from udccal.fitting.backscatter.parameters import (
     NAMES,
     TWO_PLANES,
     footprint_per_pupil,
     linear_of,
     linear_slope,
-    moments_along_reflection,
     most_probable,
     prior_of,
 )
+from udccal.fitting.backscatter.posterior import TermAt, moments_along_reflection
+from udccal.fitting.backscatter.read import grid_rays
 from udccal.fitting.backscatter.solve import Problem, search
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter

@@ -13,16 +13,10 @@ from udccal.bins import Bins, block_weights
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.cfa import PATTERNS, Cfa, cfa_named
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.data import (
-    BackscatterData,
-    Binned,
-    Binning,
-    grid_step,
-    read_backscatter,
-    visible_crop,
-)
+from udccal.fitting.backscatter.data import BackscatterData, Binned
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import BackscatterRules
+from udccal.fitting.backscatter.read import binned, grid_step, read_backscatter, visible_crop
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter, backscatter_rate
@@ -240,7 +234,7 @@ def test_a_bin_is_clipped_from_the_fraction_of_saturation_that_the_rules_say(mos
     mean = np.full((8, 8), float(noise.black_DN), np.float32)
     mean[0, 0], mean[0, 4] = 0.99 * float(noise.saturation_DN), 0.7 * float(noise.saturation_DN)
     average = Average(mean, np.ones_like(mean), FRAMES)
-    found = Binning(noise, np.ones(mean.shape), Bins("RGGB", 4), most).of(average, EXPOSURE_S)
+    found = binned([(average, EXPOSURE_S)], noise, np.ones(mean.shape), Bins("RGGB", 4), most)
     assert found.clipped.sum() == clipped
 
 

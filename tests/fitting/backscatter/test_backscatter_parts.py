@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from udccal.fitting.backscatter.data import Binned, Profile, directions, grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.data import Binned, Profile
 from udccal.fitting.backscatter.model import (
     PanelCrop,
     Pictures,
@@ -30,6 +30,7 @@ from udccal.fitting.backscatter.parameters import (
     vector_of,
     with_linear,
 )
+from udccal.fitting.backscatter.read import directions, grid_step, sampled_rays, visible_crop
 from udccal.fitting.backscatter.solve import Fitted, typical_error
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import emitter_shares, panel_response, response_grid, window_corners

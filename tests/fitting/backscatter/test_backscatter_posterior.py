@@ -9,16 +9,8 @@ import pytest
 from scipy.special import expit
 
 from tests.scenes.backscatter import PICTURES, RULES, panel_pictures, shots_of, small_rig, world
-from udccal.fitting.backscatter.parameters import (
-    NAMES,
-    REFLECTION,
-    TWO_PLANES,
-    Moments,
-    MostProbable,
-    moments_along_reflection,
-    most_probable,
-    prior_of,
-)
+from udccal.fitting.backscatter.parameters import NAMES, REFLECTION, TWO_PLANES, MostProbable, most_probable, prior_of
+from udccal.fitting.backscatter.posterior import Moments, moments_along_reflection
 from udccal.fitting.backscatter.solve import Problem, held_out, search
 from udccal.rig import load_rig
 

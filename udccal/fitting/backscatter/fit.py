@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import final
-
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.linalg import block_diag
+from jaxtyping import Bool
 
 from udccal.arguments import check_kind
 from udccal.errors import FitError
-from udccal.fitting.backscatter.checks import check_grid
-from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_rays, grid_step
-from udccal.fitting.backscatter.misfits import Brightness, brightness, disagreement, residual_pattern
-from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.data import BackscatterData, Binned
+from udccal.fitting.backscatter.model import Usable, window_for
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
     DISTANCE,
@@ -24,21 +16,15 @@ from udccal.fitting.backscatter.parameters import (
     OFFSET,
     PUPIL,
     BackscatterRules,
-    Moments,
-    MostProbable,
-    Vector,
     footprint_per_pupil,
     linear_of,
     linear_slope,
-    moments_along_reflection,
-    most_probable,
     value_slope,
     values_of,
-    with_linear,
 )
+from udccal.fitting.backscatter.posterior import Misfits, TermAt, linear_cov, scaled, value_moments
+from udccal.fitting.backscatter.read import grid_step
 from udccal.fitting.backscatter.solve import BAD_BINS, BAD_PICTURES, Found, Problem, search
-from udccal.fitting.engine.gaussian import Posterior, square_root
-from udccal.fitting.engine.misfit import MisfitTest
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.nominal import absent_backscatter
@@ -48,8 +34,6 @@ from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 from udccal.rig import RigDescription
 
-# Interpolation never combines bins at this distance.
-_TILE = 4
 # Cells of the map of sigma, down and across.
 _CELLS = 48
 
@@ -77,8 +61,10 @@ def fit_backscatter(
         FitError: when the data's grid is not that of the rig's sensor.
     """
     check_kind(data, BackscatterData, "Give the binned rates as one.", FitError)
-    check_grid(data.shots, grid_step(rig), rig)
-    rules = rules or BackscatterRules()
+    rules, step, found = rules or BackscatterRules(), grid_step(rig), data.shots.rate.shape
+    shape = rig.camera.rows // step, rig.camera.columns // step
+    if found[0] and found[2:] != shape:
+        raise FitError(f"Expected a grid of {shape} bins for this sensor, found {found[2:]}. Bin all of the sensor.")
     keep = data.shots.clipped.mean(axis=(1, 2, 3))[1:-1] <= rules.most_clipped
     if (unusable := _unusable(data.shots, keep, rules)) is not None:
         return FitResult.failed("backscatter", absent_backscatter(rig, geometry), *unusable)
@@ -108,20 +94,19 @@ def _unusable(
 def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped: list[str]) -> FitResult[Backscatter]:
     """Return the fit as a result; ``clipped`` names the pictures that were left out before it."""
     fitted, used, problem = found.fitted, found.fitted.used, found.problem
-    rest, bright = residual_pattern(found), brightness(found)
-    wider = disagreement(found, bright.errors)
-    values = value_moments(found, rest.inflation)
+    misfits, term_at, (status, advice) = Misfits.of(found), TermAt.of(data, found), _status(found)
+    inflation = misfits.pattern.inflation
+    values = value_moments(found, inflation)
     # A pattern has widened all parameters already.
-    scale = np.sqrt(np.maximum(wider / rest.inflation, 1.0))
-    cov = values.cov * np.outer(scale, scale) + scaled(bright.cov, value_slope(fitted.found.x))
+    cov = scaled(values.cov, np.sqrt(np.maximum(misfits.wider / inflation, 1.0)))
+    cov += scaled(misfits.by_brightness, value_slope(fitted.found.x))
     # Pictures give lengths in panel pixels only: lengths change with the pitch.
     pitch, lengths = rig.panel.pitch_mm, np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]) * values.mean
     cov += (pitch.tolerance / pitch.value) ** 2 * np.outer(lengths, lengths)
     scale = np.where(np.arange(len(NAMES)) == PUPIL, 1 / footprint_per_pupil(rig), 1.0)
-    cov *= np.outer(scale, scale)
-    term_at, (status, advice) = TermAt.of(data, found), _status(found)
-    by_brightness = scaled(bright.cov, linear_slope(fitted.found.x))
-    posterior = term_at.posterior(linear_cov(found, np.maximum(wider, rest.inflation)) + by_brightness)
+    cov = scaled(cov, scale)
+    by_brightness = scaled(misfits.by_brightness, linear_slope(fitted.found.x))
+    posterior = term_at.posterior(linear_cov(found, np.maximum(misfits.wider, inflation)) + by_brightness)
     nominal = values_of(problem.prior.mean)
     priors = priors_of(NAMES, nominal * scale, problem.prior.sigma * value_slope(nominal) * scale)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
@@ -139,12 +124,12 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
         diagnostics=(
             Diagnostic("held_out_without_noise_of_peak", found.held_out, "1"),
             Diagnostic("model_error_of_white", found.model_error, "1"),
-            Diagnostic("pattern_p_value", rest.p_value, "1"),
-            Diagnostic("pattern_inflation", rest.inflation, "1"),
+            Diagnostic("pattern_p_value", misfits.pattern.p_value, "1"),
+            Diagnostic("pattern_inflation", inflation, "1"),
             Diagnostic("frame_scatter_over_noise", scatter, "1"),
             Diagnostic("pictures", float(found.good[1:-1].sum()), "1"),
         ),
-        notes=(*advice, *_notes(found, rest, bright, wider, scatter, clipped)),
+        notes=(*advice, *_notes(found, misfits, scatter, clipped)),
         outliers=_outliers(found, data, clipped),
         # The eliminated mask reduces the residuals' variance; the factor corrects for it.
         residuals=residual_sample(
@@ -155,11 +140,6 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
         # Of the light of white by the frames' noise, at the fitted kernels.
         map_sigma=np.asarray(coarse(term_at.mask[1] ** -2.0, _CELLS) ** -0.5, dtype=np.float32),
     )
-
-
-def scaled(cov: Float[np.ndarray, "n n"], slope: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-    """Return the covariance of numbers with these derivatives by the parameters of ``cov``."""
-    return np.asarray(cov * np.outer(slope, slope))
 
 
 def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
@@ -194,26 +174,25 @@ def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
     return FitStatus.CONVERGED, ()
 
 
-def _notes(
-    found: Found, rest: MisfitTest, bright: Brightness, wider: Vector, scatter: float, clipped: list[str]
-) -> tuple[str, ...]:
+def _notes(found: Found, misfits: Misfits, scatter: float, clipped: list[str]) -> tuple[str, ...]:
     notes = [f"{len(clipped)} clipped pictures left out."] if clipped else []
     if found.model_error > 0:
         notes.append(f"Ratios to white are modelled to {found.model_error:.2%} only; that counts as noise.")
-    if rest.inflation > 1:
+    if misfits.pattern.inflation > 1:
         notes.append(
-            f"Residuals have a pattern (p = {rest.p_value:.1g}); all sigmas are {np.sqrt(rest.inflation):.1f} times "
-            "those of independent ones."
+            f"Residuals have a pattern (p = {misfits.pattern.p_value:.1g}); all sigmas are "
+            f"{np.sqrt(misfits.pattern.inflation):.1f} times those of independent ones."
         )
-    if bright.sigma > 0:
+    if misfits.brightness > 0:
         notes.append(
-            f"The panel's brightness differs by {100 * bright.sigma:.2g} % from picture to picture (p = "
-            f"{bright.test.p_value:.1g}), which sigmas include. Hold it, and expose for whole periods of its refresh."
+            f"The panel's brightness differs by {100 * misfits.brightness:.2g} % from picture to picture (p = "
+            f"{misfits.brightness_test.p_value:.1g}), which sigmas include. Hold it, and expose for whole periods of "
+            "its refresh."
         )
-    if (most := float(np.sqrt(wider.max()))) > 1:
+    if (most := float(np.sqrt(misfits.wider.max()))) > 1:
         notes.append(
             "Parts of the sensor ask for different kernels: the model is not true there. Sigmas are up to "
-            f"{most:.1f} times those of a true model ({NAMES[int(wider.argmax())]})."
+            f"{most:.1f} times those of a true model ({NAMES[int(misfits.wider.argmax())]})."
         )
     if scatter > found.problem.rules.steady:
         notes.append(
@@ -240,101 +219,3 @@ def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[
         *outliers("bins with clipped samples", named(~usable)),
         *BAD_BINS.listed(named(outlying & ~bad[:, None, None])),
     )
-
-
-def value_moments(found: Found, inflation: float) -> Moments:
-    """Return the values' moments; ``inflation`` is the factor of the noise's variance that a pattern asks for."""
-    problem, free, solved = found.problem, found.fitted.order.free, found.fitted.found
-    errors_at = problem.errors_at(found.fitted.best.weight / np.sqrt(inflation))
-    if inflation > 1:
-        # The prior stays the same: only the pictures hold less information.
-        solved = most_probable(errors_at, solved.x, free, problem.prior)
-    own = moments_along_reflection(errors_at, solved, free, problem.prior)
-    return _over_orders(found, own, lambda other: Moments.log_normal(other.x, other.cov))
-
-
-def linear_cov(found: Found, inflation: Vector) -> Float[np.ndarray, "18 18"]:
-    """Return the covariance of the numbers of ``linear_of``; ``inflation`` has factors of the parameters' variances."""
-
-    def moments(of: MostProbable, factor: Vector | float = 1.0) -> Moments:
-        slope = linear_slope(of.x) * np.sqrt(factor)
-        return Moments(linear_of(of.x), of.cov * np.outer(slope, slope))
-
-    return _over_orders(found, moments(found.fitted.found, inflation), moments).cov
-
-
-def _over_orders(found: Found, own: Moments, moments: Callable[[MostProbable], Moments]) -> Moments:
-    """Return the chosen order's moments; other orders widen the covariance by their probability."""
-    orders = found.orders
-    parts = [own if one is orders.best else moments(one.fit.found) for one in orders.tried]
-    return Moments.mixture(parts, orders.probabilities, own.mean)
-
-
-@final
-@dataclass(frozen=True)
-class TermAt:
-    """The term as a function of its parameters (``linear_of``), and of ``_TILE`` squared numbers of the mask's noise.
-
-    The mask is the most probable one for all shots and follows the parameters linearly. Bins with the same number are
-    so far from each other that no interpolated value depends on two of them. Their signs are random, so that sums over
-    the sensor are right on average.
-    """
-
-    template: Backscatter
-    data: BackscatterData
-    good: Bool[np.ndarray, " shots"]
-    model_error: float
-    theta: Vector
-
-    @classmethod
-    def of(cls, data: BackscatterData, found: Found) -> TermAt:
-        """The term of a fit, from all shots over the whole grid."""
-        theta, template, shape = linear_of(found.fitted.found.x), found.problem.template, data.shots.rate.shape[2:]
-        rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))
-        template = replace(template, window=window_for(template, theta, rays, slack=0.5))
-        return cls(template, data, found.good, found.model_error, theta)
-
-    @in_float64
-    def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:
-        """Return the term; its mask is never below 0."""
-        (theta, noise), (mask, sigma) = np.split(parameters, [len(self.theta)]), self.mask
-        down, across = np.indices(mask.shape[1:]) % _TILE
-        mask = mask + sigma * noise.reshape(_TILE, _TILE)[down, across]
-        if (moved := theta - self.theta).any():
-            mask = mask + np.einsum("k,kcij->cij", moved, self._mask_jacobian)
-        return replace(with_linear(self.template, theta), mask=np.maximum(mask, 0.0))
-
-    @functools.cached_property
-    def mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
-        """Light of white over the whole grid, and its sigma with a random sign, in e-/s."""
-        shape = self.data.shots.rate.shape[1:]
-        parts = [(np.maximum(one.mask, 0.0), np.maximum(one.information, 1e-30)) for _, one in self._profiles(512)]
-        mask, information = (np.concatenate(part, axis=1).reshape(shape) for part in zip(*parts, strict=True))
-        return mask, np.random.default_rng(0).choice([-1.0, 1.0], shape) / np.sqrt(information)
-
-    @functools.cached_property
-    def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
-        """Derivatives of the mask by the parameters, computed only when the posterior is used."""
-        parts = [
-            best.mask_jacobian(ratios_and_jacobian(self.template, self.theta, rays, self.data.pictures)[1])
-            for rays, best in self._profiles(256)
-        ]
-        return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
-
-    def _profiles(self, size: int) -> Iterator[tuple[Rays, Profile]]:
-        """Rays, mask and dark signal of ``size`` positions at once: first with the data's weights, then the model's."""
-        shots, template = self.data.shots, self.template
-        every = np.arange(shots.rate[0, 0].size)
-        for flat in np.split(every, every[size::size]):
-            rays, seen = grid_rays(template.geometry, shots.rate.shape[2:], template.step, flat), shots.at(flat)
-            usable = seen.usable & self.good[:, None, None]
-            ratio = ratios(template, self.theta, rays, self.data.pictures)
-            best = Profile.of(seen, ratio, seen.first_weights(usable))
-            for _ in range(2):
-                best = Profile.of(seen, ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
-            yield rays, best
-
-    def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
-        """Return the posterior with this covariance of the parameters, and with the mask's noise."""
-        factor = block_diag(square_root(cov), np.eye(_TILE**2))
-        return Posterior(np.concatenate([self.theta, np.zeros(_TILE**2)]), factor, self)

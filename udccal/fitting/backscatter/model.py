@@ -50,7 +50,7 @@ class _Footprints(NamedTuple):
 
 
 def _footprints(template: Backscatter, theta: Vector, rays: Rays) -> _Footprints:
-    """Return ``models.backscatter.footprints`` of both planes."""
+    """``models.backscatter.footprints`` of both planes."""
     geometry, pitch = template.geometry, float(np.asarray(template.pitch_mm))
     slope = rays[:, :2] / rays[:, 2:]
     across = Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).as_matrix()[:, :2] * np.exp(theta[PUPIL]) / 2
@@ -62,11 +62,7 @@ def _footprints(template: Backscatter, theta: Vector, rays: Rays) -> _Footprints
 def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -> int:
     """Return the odd number of panel pixels across a window that holds both footprints at every position.
 
-    Args:
-        template: gives the geometry.
-        theta: of ``parameters.linear_of``.
-        rays: in panel coordinates.
-        slack: distance between footprints and the window's edge in panel px.
+    Between footprints and the window's edge are ``slack`` panel px; ``theta`` is of ``parameters.linear_of``.
     """
     at, emitters = _footprints(template, theta, rays), emitters_of(theta)
     reach_px = np.linalg.norm(at.shape, axis=2).max(axis=1) + np.abs(at.centre[:, 1] - at.centre[:, 0]).max(axis=1) / 2
@@ -207,7 +203,10 @@ def _soft_edge(
 
 
 def ratios(template: Backscatter, theta: Vector, rays: Rays, shown: Pictures) -> PerShot:
-    """Return the light of pictures over that of white, by shot, colour and position."""
+    """Return the light of pictures over that of white, by shot, colour and position.
+
+    ``template`` gives geometry and window, ``theta`` is of ``parameters.linear_of``, rays are in panel coordinates.
+    """
     return ratios_of(theta, Shares.of(template, theta, rays), shown, shown.light(float(theta[0]))[0])
 
 
@@ -218,12 +217,7 @@ def ratios_of(theta: Vector, shares: Shares, shown: Pictures, panel: Float[np.nd
 
 
 def ratios_and_jacobian(template: Backscatter, theta: Vector, rays: Rays, shown: Pictures) -> tuple[PerShot, Moves]:
-    """Return ``ratios``, by shot, colour and position, and their derivatives by each of ``theta``.
-
-    Args:
-        template, theta: geometry and window; parameters of ``parameters.linear_of``.
-        rays, shown: in panel coordinates; what the panel showed.
-    """
+    """Return ``ratios``, by shot, colour and position, and their derivatives by each of ``theta``."""
     shares, (panel, by_gamma) = Shares.of(template, theta, rays, derivatives=True), shown.light(float(theta[0]))
     light, slope = shares.light(shown, panel), _footprints(template, theta, rays).slope.T[:, :, None, None]
     whole, by_x, by_y, by_softness, by_pupil = _joined(theta, light)
@@ -248,7 +242,7 @@ def ratios_and_jacobian(template: Backscatter, theta: Vector, rays: Rays, shown:
 
 
 def _joined(theta: Vector, light: Float[np.ndarray, "*k n 2 3 shots"]) -> Float[np.ndarray, "*k n 3 shots"]:
-    """Return the light of both planes together."""
+    """The light of both planes together."""
     return (1 - theta[REFLECTION]) * light[..., 0, :, :] + theta[REFLECTION] * light[..., 1, :, :]
 
 

@@ -1,4 +1,4 @@
-"""The backscatter term as a vector of parameters: coordinates, prior, orders, most probable values and their moments.
+"""The backscatter term as a vector of parameters: coordinates, prior, orders, and the most probable values.
 
 Lengths, softness, reflection and crosstalk cannot be negative: the solver works on their logarithms. The prior is
 normal in the solver's coordinates: nominal values with the tolerances of the rig, and wide where no data sheet helps.
@@ -7,7 +7,7 @@ Light is close to linear in other coordinates (``linear_of``), in which orders w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -16,11 +16,12 @@ from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, Step, minimise
-from udccal.fitting.engine.orders import evidence
 from udccal.models.backscatter import Backscatter
 from udccal.rig import RigDescription
 
 Vector = Float[np.ndarray, "18"]
+Cov = Float[np.ndarray, "18 18"]
+Free = Bool[np.ndarray, "18"]
 NAMES = (
     "gamma", "standoff_mm", "pupil_diameter_mm", "softness_px", "reflection", "reflection_mm",
     "offset_x_px", "offset_y_px", "red_x_px", "red_y_px", "blue_x_px", "blue_y_px",
@@ -31,7 +32,7 @@ DISTANCE, PUPIL, SOFTNESS, REFLECTION, DEPTH = range(1, 6)
 OFFSET, EMITTERS, MIX = slice(6, 8), slice(8, 12), slice(12, 18)
 # Rows and columns of the crosstalk in the mix.
 OFF_DIAGONAL = np.nonzero(~np.eye(3, dtype=bool))
-_LOGARITHMIC = np.isin(np.arange(18), np.r_[1:6, 12:18])
+LOGARITHMIC = np.isin(np.arange(18), np.r_[1:6, 12:18])
 # Parameters in the solver's coordinates to whitened errors and their Jacobian.
 ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
 # Replaces the logarithm of 0.
@@ -49,11 +50,6 @@ class BackscatterRules:
         clipped: fraction of saturation from which a mean counts as clipped.
         most_clipped: fraction of clipped bins above which a shot is left out whole; others lose their clipped bins.
         visible_sigma: white counts as dark below this many sigma of a bin at the 90th percentile of bins.
-        most_wider: a fit whose footprints are this many times as wide as nominal ones has gone astray.
-        first_error: assumed model error of a fit from far away, as a fraction of white.
-        settled: such a fit continues while its model error falls below this factor of the one before.
-        reflections: light of the second plane over that of the first, where fits of two planes start. If the farther
-            plane is brighter, a fit that starts with a brighter nearer plane may end at its mirror image.
         worse_pictures: a picture whose residuals are this many times those of the others is an outlier.
         nothing_fits: model error, as a fraction of white, from which orders are not compared.
         held_out: the n in "every n-th picture is predicted by a fit without it".
@@ -71,10 +67,6 @@ class BackscatterRules:
     clipped: float = 0.98
     most_clipped: float = 0.02
     visible_sigma: float = 2.0
-    most_wider: float = 3.0
-    first_error: float = 0.3
-    settled: float = 0.7
-    reflections: tuple[float, ...] = (4.0, 1.0, 0.2)
     worse_pictures: float = 4.0
     nothing_fits: float = 0.05
     held_out: int = 4
@@ -93,7 +85,7 @@ class Order:
     """A candidate: its free parameters; the others are held."""
 
     name: str
-    free: Bool[np.ndarray, "18"]
+    free: Free
 
     @property
     def parameters(self) -> int:
@@ -128,15 +120,6 @@ TWO_PLANES = Order("two planes", np.ones(len(NAMES), dtype=bool))
 ONE_PLANE = TWO_PLANES.without("one plane", REFLECTION, DEPTH)
 # Simplest first.
 KERNELS = (ONE_PLANE.without("one plane, primaries in one place", EMITTERS), ONE_PLANE, TWO_PLANES)
-
-
-def split_plane(x: Vector, prior: Prior, reflection: float) -> Vector:
-    """Add a reflection to one plane's parameters, so that the mean distance of the light stays the same."""
-    split = x.copy()
-    split[REFLECTION], split[DEPTH] = np.log(reflection), prior.mean[DEPTH]
-    between = np.exp(x[DISTANCE]) - np.exp(split[DEPTH]) * reflection / (1 + reflection)
-    split[DISTANCE] = np.log(between) if between > 0 else x[DISTANCE]
-    return split
 
 
 def footprint_per_pupil(rig: RigDescription) -> float:
@@ -174,38 +157,12 @@ def prior_of(rig: RigDescription) -> Prior:
 def values_of(x: Vector) -> Vector:
     """Return the parameters in the estimates' units: lengths at the nominal pitch, the footprint for the pupil."""
     with np.errstate(over="ignore"):
-        return np.where(_LOGARITHMIC, np.where(x > _ABSENT, np.exp(x), 0.0), x)
+        return np.where(LOGARITHMIC, np.where(x > _ABSENT, np.exp(x), 0.0), x)
 
 
 def value_slope(values: Vector) -> Vector:
     """Return the derivative of each of ``values_of`` by its own solver's coordinate."""
-    return np.where(_LOGARITHMIC, values, 1.0)
-
-
-@final
-@dataclass(frozen=True)
-class Moments:
-    """Mean and covariance of parameters, such as the values in the units of the estimates."""
-
-    mean: Vector
-    cov: Float[np.ndarray, "18 18"]
-
-    @classmethod
-    def log_normal(cls, x: Vector, cov: Float[np.ndarray, "18 18"]) -> Moments:
-        """Return the moments of the values if the solver's coordinates are normal."""
-        mean = values_of(x) * np.where(_LOGARITHMIC, np.exp(0.5 * np.diag(cov)), 1.0)
-        slope, both = value_slope(mean), np.outer(_LOGARITHMIC, _LOGARITHMIC)
-        return cls(mean, np.outer(slope, slope) * np.where(both, np.expm1(cov), cov))
-
-    @classmethod
-    def mixture(
-        cls, parts: Sequence[Moments], weights: Float[np.ndarray, " parts"], mean: Vector | None = None
-    ) -> Moments:
-        """Combine each part's covariance and its distance from ``mean``, by default from the mean of all."""
-        means = np.stack([one.mean for one in parts])
-        off = means - (mean := weights @ means if mean is None else mean)
-        within = np.einsum("p,pkl->kl", weights, np.stack([one.cov for one in parts]))
-        return cls(mean, within + np.einsum("p,pk,pl->kl", weights, off, off))
+    return np.where(LOGARITHMIC, values, 1.0)
 
 
 def linear_of(x: Vector) -> Vector:
@@ -235,7 +192,7 @@ def vector_of(term: Backscatter) -> Vector:
     places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
     crosstalk = (mix / np.diag(mix)[:, None])[OFF_DIAGONAL]
     x = np.concatenate([[float(np.asarray(one)) for one in (term.gamma, *lengths)], *places, crosstalk])
-    return np.where(_LOGARITHMIC, np.log(np.maximum(x, 1e-6)), x)
+    return np.where(LOGARITHMIC, np.log(np.maximum(x, 1e-6)), x)
 
 
 def emitters_of(theta: Vector) -> Float[np.ndarray, "3 2"]:
@@ -267,7 +224,7 @@ class MostProbable:
     """The most probable parameters; ``cov`` is 0 for those that are held, ``cost`` includes the prior's part."""
 
     x: Vector
-    cov: Float[np.ndarray, "18 18"]
+    cov: Cov
     cost: float
     converged: bool
 
@@ -278,7 +235,7 @@ class _Descent:
     """The engine's problem, with a prior that says nothing of the parameters that are held."""
 
     errors_at: ErrorsAt
-    free: Bool[np.ndarray, "18"]
+    free: Free
     prior: Prior
     name: str = "backscatter"
 
@@ -290,47 +247,10 @@ class _Descent:
         return place + step.shared
 
 
-def most_probable(errors_at: ErrorsAt, start: Vector, free: Bool[np.ndarray, "18"], prior: Prior) -> MostProbable:
+def most_probable(errors_at: ErrorsAt, start: Vector, free: Free, prior: Prior) -> MostProbable:
     """Minimise the cost of errors and prior over the free parameters."""
     found = minimise(_Descent(errors_at, free, Prior(prior.mean, prior.root * free)), start)
     last, cov = found.equations, np.zeros((len(free), len(free)))
     if np.isfinite(last.cost):
         cov = found.with_rest(last.cov())
     return MostProbable(found.place, cov, last.cost, found.converged)
-
-
-def moments_along_reflection(
-    errors_at: ErrorsAt, solved: MostProbable, free: Bool[np.ndarray, "18"], prior: Prior
-) -> Moments:
-    """Return mean and covariance of the values around the most probable parameters.
-
-    The log likelihood is close to a parabola in all of the solver's coordinates except the logarithm of the reflection.
-    That has no bound once nearly all light, or nearly none, comes by way of the glass. Along it the posterior is
-    computed at equal steps. At each step all other parameters are normal and are integrated out by Laplace's method
-    (Tierney and Kadane, Journal of the American Statistical Association 81, 1986).
-    """
-    step = float(np.sqrt(max(solved.cov[REFLECTION, REFLECTION], 0.0)))
-    # A posterior this narrow is normal: its mean is off by a twentieth of a sigma at most.
-    if not free[REFLECTION] or step < 0.1 or not solved.converged:
-        return Moments.log_normal(solved.x, solved.cov)
-    others = free & (np.arange(len(free)) != REFLECTION)
-
-    def node(start: Vector) -> tuple[MostProbable, float]:
-        """Return the others at this reflection, and the posterior's logarithm there."""
-        held = most_probable(errors_at, start, others, prior)
-        off = float((start - prior.mean)[REFLECTION] / prior.sigma[REFLECTION])
-        return held, -0.5 * evidence(held.cost + off**2, held.cov[np.ix_(others, others)], prior.sigma[others])
-
-    nodes = [node(solved.x)]
-    for sign in (1.0, -1.0):
-        x, way = nodes[0][0].x, sign * solved.cov[:, REFLECTION] / step
-        for _ in range(12):
-            nodes.append(node(x + way))
-            x, way = nodes[-1][0].x, nodes[-1][0].x - x
-            # The variance grows with the square of the value, so that larger values have more weight.
-            ahead = 2 * max(float(x[REFLECTION] - nodes[0][0].x[REFLECTION]), 0.0)
-            if not nodes[-1][1] - nodes[0][1] + ahead > -6.0:
-                break
-    # With equal steps, sums approximate integrals of such smooth functions to many digits.
-    weights = np.exp([log - max(log for _, log in nodes) for _, log in nodes])
-    return Moments.mixture([Moments.log_normal(one.x, one.cov) for one, _ in nodes], weights / weights.sum())

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import ndtri
 
-from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_step, sampled_rays
+from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile
 from udccal.fitting.backscatter.model import (
     Moves,
     PerShot,
@@ -28,6 +28,8 @@ from udccal.fitting.backscatter.model import (
     window_for,
 )
 from udccal.fitting.backscatter.parameters import (
+    DEPTH,
+    DISTANCE,
     KERNELS,
     MIX,
     OFFSET,
@@ -43,9 +45,9 @@ from udccal.fitting.backscatter.parameters import (
     linear_slope,
     most_probable,
     prior_of,
-    split_plane,
     values_of,
 )
+from udccal.fitting.backscatter.read import grid_step, sampled_rays
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.misfit import chi2_test, excess_sigma, robust_excess_sigma
 from udccal.fitting.engine.orders import Attempt, Choice, choose, evidence
@@ -121,8 +123,8 @@ class Problem:
         # The likelihood gives the mask; the template's has a single bin.
         template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
         theta = linear_of(prior.mean)
-        # Beyond this width a fit has gone astray.
-        template = replace(template, window=int(rules.most_wider * window_for(template, theta, rays, 0.5)))
+        # A fit whose footprints are more than three times as wide as nominal ones has gone astray.
+        template = replace(template, window=int(3.0 * window_for(template, theta, rays, 0.5)))
         seen, shown, start = data.shots.at(flat), data.pictures, prior.mean.copy()
         weight = seen.first_weights(seen.usable)
         shares, panel = Shares.of(template, theta, rays), shown.light(float(theta[0]))[0]
@@ -196,7 +198,7 @@ class Found:
 def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
     """Fit the orders and choose the one of largest evidence; ``kernels`` has one item if the order is known."""
     rules, usable = problem.rules, problem.seen.usable
-    simple = _from_afar(problem, ONE_PLANE, problem.start, usable, rules.first_error)
+    simple = _from_afar(problem, ONE_PLANE, problem.start, usable, 0.3)
     rich = _two_planes(problem, simple, usable & ~_bad_shots(problem, simple))
     # Look for bad shots again: one plane describes some good pictures badly.
     usable = _without_outliers(problem, rich, usable & ~_bad_shots(problem, rich))
@@ -218,20 +220,18 @@ def refit(problem: Problem, fitted: Fitted, usable: Usable) -> tuple[Fitted, flo
 
 
 def _from_afar(problem: Problem, order: Order, x: Vector, usable: Usable, error: float) -> Fitted:
-    """Fit with this model error of the start as noise: with noise alone, the prior would have no effect."""
+    """Fit with this model error of the start, of white, as noise: with noise alone, the prior would have no effect."""
     for _ in range(30):
         fitted = problem.solved(order, x, problem.seen.first_weights(usable, error))
         x, before, error = fitted.found.x, error, typical_error(fitted, problem.seen)
-        if error > problem.rules.settled * before:
+        if error > 0.7 * before:
             break
     return fitted
 
 
 def typical_error(fitted: Fitted, seen: Binned) -> float:
     """Return a robust model error relative to white, on which bad pictures have little effect."""
-    used = fitted.used
-    used[0] = False
-    return robust_excess_sigma(*fitted.squares(seen, used))
+    return robust_excess_sigma(*fitted.squares(seen, fitted.used))
 
 
 def _two_planes(problem: Problem, simple: Fitted, usable: Usable) -> Fitted:
@@ -239,8 +239,15 @@ def _two_planes(problem: Problem, simple: Fitted, usable: Usable) -> Fitted:
     prior, seen = problem.prior, problem.seen
     # Not above one plane's model error: with a much larger one, all starts would end at the prior's mean.
     error, noise = typical_error(simple, seen), seen.first_weights(usable)
-    starts = [split_plane(simple.found.x, prior, reflection) for reflection in problem.rules.reflections]
-    fits = [_from_afar(problem, TWO_PLANES, x, usable, error) for x in starts]
+    fits = []
+    # If the farther plane is brighter, a fit that starts with a brighter nearer one may end at its mirror image.
+    for reflection in (4.0, 1.0, 0.2):
+        # The mean distance of the light stays that of one plane.
+        x, depth = simple.found.x.copy(), np.exp(prior.mean[DEPTH])
+        between = np.exp(x[DISTANCE]) - depth * reflection / (1 + reflection)
+        x[REFLECTION], x[DEPTH] = np.log(reflection), prior.mean[DEPTH]
+        x[DISTANCE] = np.log(between) if between > 0 else x[DISTANCE]
+        fits.append(_from_afar(problem, TWO_PLANES, x, usable, error))
     return min(fits, key=lambda one: Profile.of(seen, one.ratio, noise).chi2 + prior.cost(one.found.x))
 
 

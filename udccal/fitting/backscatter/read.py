@@ -1,0 +1,150 @@
+"""From a session to the data of the backscatter fit: the grid of the bins, and the rays of positions on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from udccal.bins import Bins
+from udccal.fitting.backscatter.data import BackscatterData, Binned
+from udccal.fitting.backscatter.model import PanelCrop, Rays, corners_of
+from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
+from udccal.fitting.nominal import nominal_backscatter
+from udccal.fitting.wire.data import ideal_points
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise, linear_signal, variance_e
+from udccal.rig import RigDescription
+from udccal.sessions.schema import DarkSubject, PanelSubject
+from udccal.sessions.store import Average, Session
+
+# One compilation instead of one per operation.
+_variance_e = jax.jit(variance_e)
+
+
+def read_backscatter(
+    session: Session, noise: Noise, geometry: Geometry, shading: Float[np.ndarray, "rows columns"]
+) -> BackscatterData:
+    """Bin the averages of the steps ``backscatter/*`` of a session, one at a time.
+
+    Args:
+        session: holds ``backscatter/white``, ``backscatter/dark`` and other pictures, as averages.
+        noise: gives K, black level and saturation, and the variance of samples.
+        geometry: the rays of pixels.
+        shading: the wire's map of the sensor (``fitting.wire.sensor_map``), which divides the rates.
+
+    Returns:
+        rates in e-/s by bin and colour; without shots where white or dark were not captured.
+
+    Raises:
+        SessionError: when a file is missing or damaged.
+    """
+    crop, bins = visible_crop(geometry, session.rig), Bins(session.rig.camera.cfa, grid_step(session.rig))
+    steps = session.steps("backscatter")
+    panels = [(step, step.subject) for step in steps if isinstance(step.subject, PanelSubject)]
+    white = [step for step, subject in panels if subject.role == "white"]
+    dark = [step for step in steps if isinstance(step.subject, DarkSubject)]
+    others = [(step, subject) for step, subject in panels if subject.role != "white"]
+    shown = np.zeros((0, crop.rows, crop.columns, 3), np.uint8)
+    if not white or not dark:
+        nothing, none = np.zeros((0, 3, 1, 1)), np.zeros(0)
+        return BackscatterData(Binned(nothing, nothing, nothing, nothing > 0, none, none), shown, crop, ())
+    captures = (step.captures[0] for step in (white[0], *(step for step, _ in others), dark[0]))
+    shots = binned(((session.average(one), one.exposure_s) for one in captures), noise, shading, bins)
+    shown = np.concatenate([shown, *(crop.of(session.picture(subject))[None] for _, subject in others)])
+    return BackscatterData(shots, shown, crop, tuple(step.id for step, _ in others))
+
+
+def binned(
+    averages: Iterable[tuple[Average, float]],
+    noise: Noise,
+    shading: Float[np.ndarray, "rows columns"],
+    bins: Bins,
+    most: float = BackscatterRules.clipped,
+) -> Binned:
+    """Bin shots, given as averages in DN and exposures in s; means from ``most`` of saturation on are clipped."""
+    gain, black_DN, row_DN, saturation_DN, bend_per_DN = (
+        float(np.asarray(getattr(noise, name)))
+        for name in ("K_DN_per_e", "black_DN", "sigma_row_DN", "saturation_DN", "bend_per_DN")
+    )
+    # Variance of bins if that of a sample over its shading is 1 / shading, or 1: by sample, or by row.
+    each, row_e2, shots = 1 / shading, (row_DN / gain) ** 2, []
+    shot, sample, row = bins.variance(each), bins.variance(each**2), bins.row_variance(each**2)
+    for average, exposure_s in averages:
+        signal_e = linear_signal(average.mean - black_DN, bend_per_DN) / gain
+        clipped = average.mean >= most * saturation_DN
+        # Variance in the dark, e-^2: of a row's offset, and of each sample independently.
+        rest_e2 = max(float(np.asarray(_variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
+        expected = np.maximum(signal_e, 0.0) + rest_e2
+        shots.append(
+            Binned(
+                rate=bins.mean(signal_e / shading)[None] / exposure_s,
+                shot=shot[None] / (exposure_s * average.frames),
+                rest=(rest_e2 * sample + row_e2 * row)[None] / (exposure_s**2 * average.frames),
+                clipped=(bins.mean(clipped.astype(np.float32)) > 0)[None],
+                exposure_s=np.array([exposure_s]),
+                scatter=np.array([average.variance.mean(dtype=np.float64) / gain**2 / expected.mean()]),
+            )
+        )
+    return Binned.joined(shots)
+
+
+def grid_step(rig: RigDescription) -> int:
+    """Return the grid's spacing in sensor px: even, about an eighth of the rows' period, with a small remainder."""
+    camera = rig.camera
+    period = rig.panel.pitch_mm.value / rig.mounting.standoff_mm.value * rig.focal_px
+    largest = max(4, int(period / 8))
+    choices = range(2 * (largest // 2), max(2, int(0.6 * largest)), -2)
+    return min(choices, key=lambda step: camera.columns % step + camera.rows % step)
+
+
+def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
+    """Return the part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
+
+    Args:
+        geometry: gives the rays of pixels.
+        rig: gives the panel's size and the nominal footprints.
+    """
+    camera, panel, room_px = rig.camera, rig.panel, 12
+    edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
+    pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
+    template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), grid_step(rig), window=1)
+    middle = corners_of(template, linear_of(prior_of(rig).mean), directions(geometry, pixels))
+    first = np.clip(middle.min(axis=0) - room_px, 0, [panel.columns - 8, panel.rows - 8])
+    last = np.clip(middle.max(axis=0) + room_px + 1, first + 8, [panel.columns, panel.rows])
+    return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
+
+
+def sampled_rays(geometry: Geometry, rig: RigDescription, step: int, count: int) -> tuple[Rays, Int[np.ndarray, " n"]]:
+    """Spread about ``count`` positions evenly over the grid (Roberts's R2 sequence, of the plastic number).
+
+    Args:
+        geometry, rig: give the rays of pixels and the sensor's size.
+        step: spacing of the grid in sensor px.
+        count: number of positions wanted; those that coincide are merged.
+
+    Returns:
+        rays in panel coordinates, and flat grid indices in rising order.
+    """
+    shape = rig.camera.rows // step, rig.camera.columns // step
+    plastic = 1.32471795724474602596
+    sequence = (0.5 + np.arange(count)[:, None] / np.array([plastic, plastic**2])) % 1.0
+    columns, rows = (sequence * shape[::-1]).astype(int).T
+    flat = np.unique(rows * shape[1] + columns)
+    return grid_rays(geometry, shape, step, flat), flat
+
+
+def grid_rays(geometry: Geometry, shape: tuple[int, int], step: int, flat: Int[np.ndarray, " n"]) -> Rays:
+    """Return the rays, in panel coordinates, of positions of a grid of ``shape`` (rows, columns), by flat index."""
+    rows, columns = np.divmod(flat, shape[1])
+    return directions(geometry, step * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)
+
+
+def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Rays:
+    """Return the rays of sensor pixels in panel coordinates, as ``models.geometry.panel_directions`` does."""
+    ideal = ideal_points(geometry, pixels)
+    rays = np.insert(ideal, 2, 1.0, axis=1) @ Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).as_matrix().T
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
