@@ -8,7 +8,7 @@ from tests.fitting.geometry.boards import SIZE, SPEC, draw, pose, true_corners
 from udccal.arrangements import BoardSpec
 from udccal.board.charuco import board_points_mm, charuco_board
 from udccal.errors import FitError
-from udccal.fitting.geometry.corners import Luminance, detect_corners, luminance
+from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance
 from udccal.fitting.geometry.data import flat_field
 
 GAINS = np.array([[0.6, 1.0], [1.0, 0.7]])
@@ -25,8 +25,12 @@ def mosaic(picture: np.ndarray, noise: float = 0.0, seed: int = 0) -> np.ndarray
     return 3000 * picture * gains + noise * np.random.default_rng(seed).normal(size=picture.shape)
 
 
-def grey_of(samples: np.ndarray, noise: float = 1.0) -> Luminance:
-    return luminance(samples, np.full(samples.shape, noise**2))
+def grey_of(samples: np.ndarray) -> np.ndarray:
+    return luminance(samples, np.ones_like(samples))[0]
+
+
+def detected(samples: np.ndarray, noise: float = 1.0, spec: BoardSpec = SPEC) -> BoardCorners:
+    return detect_corners(samples, np.full(samples.shape, noise**2), spec)
 
 
 def streaked(picture: np.ndarray) -> np.ndarray:
@@ -41,19 +45,19 @@ def test_a_moved_picture_moves_the_luminance_by_as_much() -> None:
     y, x = np.mgrid[0:40, 0:40]
     for shift in (0, 1):
         blob = np.exp(-((x - 20 - shift) ** 2 + (y - 17) ** 2) / 18.0)
-        grey = grey_of(1000 * blob * np.tile(GAINS, (20, 20))).grey
+        grey = grey_of(1000 * blob * np.tile(GAINS, (20, 20)))
         assert (grey * x).sum() / grey.sum() == pytest.approx(20 + shift, abs=0.02)
         assert (grey * y).sum() / grey.sum() == pytest.approx(17, abs=0.02)
 
 
 def test_an_even_picture_has_no_pattern_left() -> None:
-    grey = grey_of(np.tile(GAINS, (20, 20))).grey
+    grey = grey_of(np.tile(GAINS, (20, 20)))
     assert np.ptp(grey) < 1e-12
 
 
 def test_corners_are_found_where_they_are(view: tuple[np.ndarray, np.ndarray]) -> None:
     picture, truth = view
-    found = detect_corners(grey_of(mosaic(picture, noise=12.0), 12.0), SPEC)
+    found = detected(mosaic(picture, noise=12.0), 12.0)
     assert len(found.ids) >= 20
     error = found.xy - truth[found.ids]
     assert np.abs(error.mean(axis=0)).max() < 0.01
@@ -64,7 +68,7 @@ def test_corners_are_found_where_they_are(view: tuple[np.ndarray, np.ndarray]) -
 @pytest.mark.medium
 def test_corners_scatter_by_noise_as_they_say(view: tuple[np.ndarray, np.ndarray]) -> None:
     """Thirty pictures of the same board: 1 within the error of so many."""
-    runs = [detect_corners(grey_of(mosaic(view[0], 40.0, seed), 40.0), SPEC) for seed in range(30)]
+    runs = [detected(mosaic(view[0], 40.0, seed), 40.0) for seed in range(30)]
     common = sorted(set.intersection(*(set(run.ids.tolist()) for run in runs)))
     assert len(common) >= 20
     picks = [np.searchsorted(run.ids, common) for run in runs]
@@ -80,10 +84,10 @@ def test_a_flat_field_takes_out_what_pulls_corners(view: tuple[np.ndarray, np.nd
     picture, truth = view
     wire = 1 + 0.05 * np.sin(2 * np.pi * np.arange(SIZE[1]) / 17)[:, None] * np.ones(SIZE[0])
     seen = mosaic(picture * wire)
-    flat = flat_field(mosaic(wire), np.ones_like(seen), np.ones(seen.shape, dtype=bool))
+    response, _ = flat_field(mosaic(wire), np.ones_like(seen), np.ones(seen.shape, dtype=bool))
     error = {}
-    for name, light in (("raw", seen), ("even", seen / flat.response)):
-        found = detect_corners(grey_of(light), SPEC)
+    for name, light in (("raw", seen), ("even", seen / response)):
+        found = detected(light)
         error[name] = np.sqrt(((found.xy - truth[found.ids]) ** 2).mean())
     assert error["even"] < 0.7 * error["raw"]
 
@@ -91,16 +95,16 @@ def test_a_flat_field_takes_out_what_pulls_corners(view: tuple[np.ndarray, np.nd
 def test_samples_that_saw_no_flat_are_left_as_they_are() -> None:
     light, told = np.full((8, 8), 100.0), np.ones((8, 8), dtype=bool)
     light[2, 2], told[4, 5] = 1.0, False
-    flat = flat_field(light, np.ones((8, 8)), told)
-    assert flat.response[2, 2] == 1.0
-    assert flat.relative_variance[4, 5] == 0.0
-    assert np.isfinite(flat.response).all()
-    np.testing.assert_allclose(flat.response[1::2], 1.0)
+    response, relative = flat_field(light, np.ones((8, 8)), told)
+    assert response[2, 2] == 1.0
+    assert relative[4, 5] == 0.0
+    assert np.isfinite(response).all()
+    np.testing.assert_allclose(response[1::2], 1.0)
 
 
 def test_streaks_along_the_rows_normal_do_not_move_corners(view: tuple[np.ndarray, np.ndarray]) -> None:
     picture, truth = view
-    found = detect_corners(grey_of(mosaic(streaked(picture), noise=12.0), 12.0), SPEC)
+    found = detected(mosaic(streaked(picture), noise=12.0), 12.0)
     assert len(found.ids) >= 15
     error = found.xy - truth[found.ids]
     assert np.abs(np.median(error, axis=0)).max() < 0.03
@@ -110,21 +114,21 @@ def test_streaks_along_the_rows_normal_do_not_move_corners(view: tuple[np.ndarra
 def test_a_picture_shifted_by_half_a_pixel_does_not_pass(view: tuple[np.ndarray, np.ndarray]) -> None:
     picture, truth = view
     half = (picture + np.roll(picture, 1, axis=1)) / 2
-    found = detect_corners(grey_of(mosaic(half)), SPEC)
+    found = detected(mosaic(half))
     assert (found.xy - truth[found.ids]).mean(axis=0)[0] == pytest.approx(0.5, abs=0.02)
 
 
 def test_no_board_gives_no_corners() -> None:
     noise = np.random.default_rng(0).uniform(0, 100, SIZE[::-1])
-    found = detect_corners(grey_of(noise), SPEC)
+    found = detected(noise)
     assert len(found.ids) == 0
     assert found.xy.shape == (0, 2)
-    assert len(detect_corners(grey_of(np.zeros(SIZE[::-1])), SPEC).ids) == 0
+    assert len(detected(np.zeros(SIZE[::-1])).ids) == 0
 
 
 def test_another_dictionary_is_not_this_board(view: tuple[np.ndarray, np.ndarray]) -> None:
     other = BoardSpec(SPEC.columns, SPEC.rows, SPEC.square_mm, SPEC.marker_mm, "DICT_4X4_50")
-    assert len(detect_corners(grey_of(mosaic(view[0])), other).ids) == 0
+    assert len(detected(mosaic(view[0]), spec=other).ids) == 0
 
 
 def test_an_unknown_dictionary_is_refused() -> None:

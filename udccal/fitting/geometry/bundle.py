@@ -155,7 +155,7 @@ class Points:
         return Points(*parts, self.index[stay], self.used[stay], tuple(np.array(self.names)[~views].tolist()))
 
     def split(self, values: Shaped[np.ndarray, "points *n"]) -> list[Shaped[np.ndarray, "_ *n"]]:
-        """What belongs to each view's points."""
+        """Values of the points, view by view."""
         return np.split(values, np.flatnonzero(np.diff(self.view)) + 1)
 
     def sums(self, values: Float[np.ndarray, " points"]) -> Float[np.ndarray, " views"]:

@@ -28,17 +28,8 @@ from udccal.fitting.geometry.bundle import RULES
 Picture = Float[np.ndarray, "rows columns"]
 
 
-@final
-@dataclass(frozen=True)
-class Luminance:
-    """Grey picture of a black-and-white subject; ``variance`` is that of its samples before they were filtered."""
-
-    grey: Picture
-    variance: Picture
-
-
-def luminance(mosaic: Picture, variance: Picture) -> Luminance:
-    """Grey picture on the mosaic's own pixels, whose black level is subtracted; ``variance`` is of single samples.
+def luminance(mosaic: Picture, variance: Picture) -> tuple[Picture, Picture]:
+    """Grey picture of a black-and-white subject, and the variance of its samples before they were filtered.
 
     The four sites of the pattern are scaled to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16. It gives
     each site one quarter at every pixel and is symmetric: that removes the pattern and moves no edge.
@@ -49,7 +40,7 @@ def luminance(mosaic: Picture, variance: Picture) -> Luminance:
         gain = total / max(float(grey[site.samples].mean()), 1e-12)
         grey[site.samples] *= gain
         spread[site.samples] *= gain**2
-    return Luminance(_filtered(grey), spread)
+    return _filtered(grey), spread
 
 
 def _filtered(picture: Float[np.ndarray, "*stack rows columns"]) -> Float[np.ndarray, "*stack rows columns"]:
@@ -67,12 +58,18 @@ class BoardCorners:
     sigma: Float[np.ndarray, " n"]
 
 
-def detect_corners(picture: Luminance, spec: BoardSpec) -> BoardCorners:
-    """Find a board's inner corners in a grey picture; the arrays are empty where there are none.
+def detect_corners(mosaic: Picture, variance: Picture, spec: BoardSpec) -> BoardCorners:
+    """Find a board's inner corners; the arrays are empty where there are none.
 
     Those out of the picture, moved away or without contrast are left out. Errors are those of ``charuco_board``.
+
+    Args:
+        mosaic: samples in any linear unit, their black level subtracted.
+        variance: of single samples, in that unit squared.
+        spec: the board.
     """
-    ids, rough = _detect(picture.grey, spec)
+    grey, spread = luminance(mosaic, variance)
+    ids, rough = _detect(grey, spec)
     if len(ids) < RULES.least_corners:
         return BoardCorners(ids[:0], rough[:0], np.zeros(0))
     edges = _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
@@ -80,13 +77,13 @@ def detect_corners(picture: Luminance, spec: BoardSpec) -> BoardCorners:
     reach = min(0.9 * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm), 0.4)
     radius = np.clip(reach * np.linalg.norm(edges, axis=2).min(axis=1), *RULES.window_px)
     half = int(np.ceil(radius.max())) + 1
-    base = np.clip(np.round(rough).astype(np.int64), half, np.array(picture.grey.shape[::-1]) - half - 1)
+    base = np.clip(np.round(rough).astype(np.int64), half, np.array(grey.shape[::-1]) - half - 1)
     dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
     where = (base[:, 1, None] + dy, base[:, 0, None] + dx)
     angles = np.arctan2(edges[..., 0], -edges[..., 1])
     start = np.concatenate([rough - base, angles, np.full((len(base), 2), np.log(1.5))], axis=1)
-    place, saddles = _fitted(start, np.stack([dx, dy], axis=1).astype(np.float64), picture.grey[where], radius)
-    xy, sigma = base + place, saddles.noise_sigma(picture.variance[where])
+    place, saddles = _fitted(start, np.stack([dx, dy], axis=1).astype(np.float64), grey[where], radius)
+    xy, sigma = base + place, saddles.noise_sigma(spread[where])
     misfit = np.sqrt(saddles.cost / np.maximum(saddles.weight.sum(-1) - 10, 1.0))
     inside = (base == np.round(rough)).all(axis=1)
     near = np.linalg.norm(xy - rough, axis=1) < np.maximum(radius / 2, 3.0)

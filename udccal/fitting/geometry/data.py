@@ -23,7 +23,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.geometry.bundle import RULES, Intrinsics, Points, Poses, camera_matrix, intrinsics_of
-from udccal.fitting.geometry.corners import BoardCorners, Picture, detect_corners, luminance
+from udccal.fitting.geometry.corners import BoardCorners, Picture, detect_corners
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.wire.data import read_wire
 from udccal.models.geometry import Geometry
@@ -82,7 +82,7 @@ def read_geometry(session: Session, noise: Noise) -> GeometryData:
     rig, nominal = session.rig, nominal_geometry(session.rig)
     shape = rig.camera.rows, rig.camera.columns
     # Without a flat field every pixel may be as unequal as the noise term says.
-    flat = FlatField(np.ones(shape), np.full(shape, float(np.asarray(noise.PRNU1288)) ** 2))
+    flat = np.ones(shape), np.full(shape, float(np.asarray(noise.PRNU1288)) ** 2)
     if {"wire/dark", "wire/flat"} <= {step.id for step in session.steps("wire")}:
         wire = read_wire(session, noise, nominal)
         flat = flat_field(wire.signal.astype(np.float64), wire.variance, wire.signal < wire.clip)
@@ -98,24 +98,20 @@ def read_geometry(session: Session, noise: Noise) -> GeometryData:
 def rig_prior(rig: RigDescription) -> Prior:
     """Prior on the intrinsics, in their order, from a rig's description.
 
-    The focal length's sigma is its tolerance. Centres lie within some per cent of the width; distortion is moderate.
+    One sigma of the focal length is its tolerance, of the centre 1 % of the width. Those of the distortion hold for
+    most lenses.
     """
     focal = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
     sigma = [*[focal] * 2, *[0.01 * rig.camera.columns] * 2, 0.2, 0.2, 1e-3, 1e-3, 0.1]
     return Prior.independent(intrinsics_of(nominal_geometry(rig)), np.array(sigma))
 
 
-@final
-@dataclass(frozen=True)
-class FlatField:
-    """Response of every sample over the mean of its CFA site, and the relative variance of that by noise."""
+def flat_field(
+    light: Picture, variance: Picture, unclipped: Bool[np.ndarray, "rows columns"]
+) -> tuple[Picture, Picture]:
+    """Response of every sample to an even field over the mean of its CFA site, and the relative variance of that.
 
-    response: Picture
-    relative_variance: Picture
-
-
-def flat_field(light: Picture, variance: Picture, unclipped: Bool[np.ndarray, "rows columns"]) -> FlatField:
-    """Response of a sensor to an even field; clipped, dead and covered samples have a response of 1.
+    Clipped, dead and covered samples have a response of 1.
 
     ``light`` has any linear unit, its black level subtracted; ``variance`` is its own, in that unit squared.
     """
@@ -126,13 +122,13 @@ def flat_field(light: Picture, variance: Picture, unclipped: Bool[np.ndarray, "r
         good = unclipped[site.samples] & (own > 0.05)
         response[site.samples][good] = own[good]
         relative[site.samples][good] = variance[site.samples][good] / light[site.samples][good] ** 2
-    return FlatField(response, relative)
+    return response, relative
 
 
 def _corners(
-    session: Session, capture: StoredCapture, spec: BoardSpec, noise: Noise, flat: FlatField
+    session: Session, capture: StoredCapture, spec: BoardSpec, noise: Noise, flat: tuple[Picture, Picture]
 ) -> tuple[BoardCorners, float]:
-    """The board in a capture (an average, or a single frame), and the part of its samples that are clipped."""
+    """The board in a capture (an average, or a single frame), and the part of its samples next to saturation."""
     mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
     black, top, bend, gain = (
         float(np.asarray(one)) for one in (noise.black_DN, noise.saturation_DN, noise.bend_per_DN, noise.K_DN_per_e)
@@ -143,9 +139,9 @@ def _corners(
     area = capture.region
     part = np.s_[area.y : area.y + area.rows, area.x : area.x + area.columns]
     # The picture as equal pixels would see it; the remaining inequality adds to the temporal noise.
-    even = light / flat.response[part]
-    spread = variance / flat.response[part] ** 2 + flat.relative_variance[part] * even**2
-    found = detect_corners(luminance(even, spread), spec)
+    response, relative = (one[part] for one in flat)
+    even = light / response
+    found = detect_corners(even, variance / response**2 + relative * even**2, spec)
     return replace(found, xy=found.xy + np.array([area.x, area.y])), float(np.mean(mean >= 0.995 * top))
 
 
