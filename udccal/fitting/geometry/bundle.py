@@ -134,6 +134,7 @@ class Points:
         view: number of the point's view among the usable ones. index: its place in its view as given.
         used: whether it takes part in the fit.
         names: the usable views by their place in what was given.
+        rules: of their fit.
     """
 
     board: Float[np.ndarray, "points 3"]
@@ -143,6 +144,7 @@ class Points:
     index: Int[np.ndarray, " points"]
     used: Bool[np.ndarray, " points"]
     names: tuple[int, ...]
+    rules: GeometryRules = RULES
 
     def scaled(self, factor: Float[np.ndarray, " views"]) -> Points:
         """With the sigma of each view's points multiplied by that view's factor."""
@@ -152,7 +154,8 @@ class Points:
         """Without these views; the others move up."""
         number, stay = (np.cumsum(~views) - 1)[self.view], ~views[self.view]
         parts = (self.board[stay], self.image[stay], self.sigma[stay], number[stay])
-        return Points(*parts, self.index[stay], self.used[stay], tuple(np.array(self.names)[~views].tolist()))
+        names = tuple(np.array(self.names)[~views].tolist())
+        return Points(*parts, self.index[stay], self.used[stay], names, self.rules)
 
     def split(self, values: Shaped[np.ndarray, "points *n"]) -> list[Shaped[np.ndarray, "_ *n"]]:
         """Values of the points, view by view."""

@@ -21,7 +21,6 @@ from udccal.errors import FitError
 from udccal.fitting.engine.misfit import MisfitTest, clustered_cov, f_test
 from udccal.fitting.geometry.bundle import (
     LENS,
-    RULES,
     BundleProblem,
     Free,
     Intrinsics,
@@ -186,7 +185,7 @@ def residual_pattern(solved: Solved, points: Points, size: tuple[int, int], dof:
     ``group_means_test`` does not serve here: the fit absorbs most of a smooth pattern, so that means of cells scatter
     far less than those of independent residuals. The covariance of the sums accounts for that.
     """
-    (z, jacobian), cells = in_sigma(solved.place, points), RULES.pattern_cells
+    (z, jacobian), cells = in_sigma(solved.place, points), points.rules.pattern_cells
     place = np.clip(points.image / np.array(size) * cells, 0, cells - 1).astype(np.int64)
     cell = place[:, 1] * cells + place[:, 0]
     inside = np.equal.outer(np.unique(cell[points.used]), cell) * points.used.astype(np.float64)
@@ -223,15 +222,16 @@ def judged(found: CalibratedViews, scales: Float[np.ndarray, " views"], by_prior
 
 
 def _status(found: CalibratedViews) -> tuple[FitStatus, tuple[str, ...]]:
+    rules = found.points.rules
     order = "Check that the points of each view are in the order of the board's."
-    if found.rms_px > RULES.no_corners_px:
+    if found.rms_px > rules.no_corners_px:
         return FitStatus.POOR_FIT, (
-            f"Expected corners within {RULES.no_corners_px:g} px of the fitted lens, found {found.rms_px:.3g} px "
+            f"Expected corners within {rules.no_corners_px:g} px of the fitted lens, found {found.rms_px:.3g} px "
             f"(RMS): no lens puts these board points there. {order}",
         )
     width = found.image_size[0]
     sigma = np.sqrt(np.diag(found.cov))[:4] / [*np.abs(found.intrinsics[:2]), width, width]
-    if sigma.max() > RULES.most_uncertain:
+    if sigma.max() > rules.most_uncertain:
         what = "focal length" if sigma.argmax() < 2 else "centre of the picture"
         return FitStatus.TOO_FEW_DATA, (
             f"The views do not determine the {what} (one sigma is {min(sigma.max(), 99.0):.0%}). "
@@ -248,7 +248,10 @@ def _remarks(found: CalibratedViews, scales: Float[np.ndarray, " views"], by_pri
             "distortion coefficient stays free within that. Lean the board another way in each view to know more."
         )
     relative = scales / np.median(scales)
-    loud = [f"{found.points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > RULES.loud_view)]
+    loud = [
+        f"{found.points.names[k]} ({relative[k]:.1f} x)"
+        for k in np.flatnonzero(relative > found.points.rules.loud_view)
+    ]
     if loud:
         yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
     if found.disagreement.found:

@@ -23,7 +23,7 @@ from scipy.special import erf
 from udccal.arrangements import BoardSpec
 from udccal.board.charuco import board_points_mm, charuco_board
 from udccal.cfa import cfa_named
-from udccal.fitting.geometry.bundle import RULES
+from udccal.fitting.geometry.bundle import RULES, GeometryRules
 
 Picture = Float[np.ndarray, "rows columns"]
 
@@ -58,7 +58,7 @@ class BoardCorners:
     sigma: Float[np.ndarray, " n"]
 
 
-def detect_corners(mosaic: Picture, variance: Picture, spec: BoardSpec) -> BoardCorners:
+def detect_corners(mosaic: Picture, variance: Picture, spec: BoardSpec, rules: GeometryRules = RULES) -> BoardCorners:
     """Find a board's inner corners; the arrays are empty where there are none.
 
     Those out of the picture, moved away or without contrast are left out. Errors are those of ``charuco_board``.
@@ -67,15 +67,16 @@ def detect_corners(mosaic: Picture, variance: Picture, spec: BoardSpec) -> Board
         mosaic: samples in any linear unit, their black level subtracted.
         variance: of single samples, in that unit squared.
         spec: the board.
+        rules: which corners count.
     """
     grey, spread = luminance(mosaic, variance)
     ids, rough = _detect(grey, spec)
-    if len(ids) < RULES.least_corners:
+    if len(ids) < rules.least_corners:
         return BoardCorners(ids[:0], rough[:0], np.zeros(0))
     edges = _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
     # The window, of a square: clear of the markers, and of the next corners.
     reach = min(0.9 * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm), 0.4)
-    radius = np.clip(reach * np.linalg.norm(edges, axis=2).min(axis=1), *RULES.window_px)
+    radius = np.clip(reach * np.linalg.norm(edges, axis=2).min(axis=1), *rules.window_px)
     half = int(np.ceil(radius.max())) + 1
     base = np.clip(np.round(rough).astype(np.int64), half, np.array(grey.shape[::-1]) - half - 1)
     dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
@@ -87,8 +88,8 @@ def detect_corners(mosaic: Picture, variance: Picture, spec: BoardSpec) -> Board
     misfit = np.sqrt(saddles.cost / np.maximum(saddles.weight.sum(-1) - 10, 1.0))
     inside = (base == np.round(rough)).all(axis=1)
     near = np.linalg.norm(xy - rough, axis=1) < np.maximum(radius / 2, 3.0)
-    contrast = np.abs(saddles.contrast) > RULES.least_contrast * misfit
-    good = inside & near & contrast & (sigma < RULES.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
+    contrast = np.abs(saddles.contrast) > rules.least_contrast * misfit
+    good = inside & near & contrast & (sigma < rules.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
     return BoardCorners(ids[good], xy[good], sigma[good])
 
 

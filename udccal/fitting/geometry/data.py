@@ -22,7 +22,7 @@ from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.geometry.bundle import RULES, Intrinsics, Points, Poses, camera_matrix, intrinsics_of
+from udccal.fitting.geometry.bundle import RULES, GeometryRules, Intrinsics, Points, Poses, camera_matrix, intrinsics_of
 from udccal.fitting.geometry.corners import BoardCorners, Picture, detect_corners
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.wire.data import read_wire
@@ -50,9 +50,9 @@ class BoardView:
     corners: BoardCorners
     clipped: float
 
-    def usable(self) -> bool:
+    def usable(self, rules: GeometryRules = RULES) -> bool:
         """Whether enough corners were found in an unclipped picture."""
-        return len(self.corners.ids) >= RULES.least_corners and self.clipped <= RULES.most_clipped
+        return len(self.corners.ids) >= rules.least_corners and self.clipped <= rules.most_clipped
 
 
 @final
@@ -68,9 +68,10 @@ class GeometryData:
     nominal: Geometry
     image_size: tuple[int, int]
     prior: Prior | None = None
+    rules: GeometryRules = RULES
 
 
-def read_geometry(session: Session, noise: Noise) -> GeometryData:
+def read_geometry(session: Session, noise: Noise, rules: GeometryRules = RULES) -> GeometryData:
     """Read the boards of all steps ``geometry/*``, and the prior on the lens from the rig's description.
 
     The noise term gives the black level, the saturation and the corners' sigma.
@@ -90,9 +91,9 @@ def read_geometry(session: Session, noise: Noise) -> GeometryData:
     for step in session.steps("geometry"):
         if isinstance(board := step.subject, BoardSubject):
             spec = BoardSpec(board.columns, board.rows, board.square_mm, board.marker_mm, board.dictionary)
-            found = _corners(session, step.captures[0], spec, noise, flat)
+            found = _corners(session, step.captures[0], spec, noise, flat, rules)
             views.append(BoardView(step.id, spec, board.parallel_to_panel, *found))
-    return GeometryData(tuple(views), nominal, shape[::-1], rig_prior(rig))
+    return GeometryData(tuple(views), nominal, shape[::-1], rig_prior(rig), rules)
 
 
 def rig_prior(rig: RigDescription) -> Prior:
@@ -126,7 +127,12 @@ def flat_field(
 
 
 def _corners(
-    session: Session, capture: StoredCapture, spec: BoardSpec, noise: Noise, flat: tuple[Picture, Picture]
+    session: Session,
+    capture: StoredCapture,
+    spec: BoardSpec,
+    noise: Noise,
+    flat: tuple[Picture, Picture],
+    rules: GeometryRules,
 ) -> tuple[BoardCorners, float]:
     """The board in a capture (an average, or a single frame), and the part of its samples next to saturation."""
     mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
@@ -141,7 +147,7 @@ def _corners(
     # The picture as equal pixels would see it; the remaining inequality adds to the temporal noise.
     response, relative = (one[part] for one in flat)
     even = light / response
-    found = detect_corners(even, variance / response**2 + relative * even**2, spec)
+    found = detect_corners(even, variance / response**2 + relative * even**2, spec, rules)
     return replace(found, xy=found.xy + np.array([area.x, area.y])), float(np.mean(mean >= 0.995 * top))
 
 
@@ -157,7 +163,10 @@ class Gathered:
 
 
 def gather(
-    board: Sequence[np.ndarray], image: Sequence[np.ndarray], sigmas: Sequence[np.ndarray] | None = None
+    board: Sequence[np.ndarray],
+    image: Sequence[np.ndarray],
+    sigmas: Sequence[np.ndarray] | None = None,
+    rules: GeometryRules = RULES,
 ) -> Gathered:
     """Every finite point of every view that determines a pose; arguments and errors as for ``fit_geometry``."""
     for given in (board, image) if sigmas is None else (board, image, sigmas):
@@ -188,20 +197,19 @@ def gather(
         good = np.isfinite(whole).all(axis=1) & (own > 0)
         lost += [f"view {number}, point {k}" for k in np.flatnonzero(~good)]
         part = (whole[good, :3], whole[good, 3:5], own[good], np.flatnonzero(good))
-        if complaint := _complaint(part[0], part[1], list(parts.values())):
+        if complaint := _complaint(part[0], part[1], list(parts.values()), rules.least_corners):
             notes.append(f"View {number} is left out: {complaint}")
         else:
             parts[number] = part
     points, pixels, own, index = (np.concatenate(same) for same in zip(*parts.values(), strict=True))
     view = np.repeat(np.arange(len(parts)) - 1, [len(part[0]) for part in parts.values()])
-    found = Points(points, pixels, own, view, index, np.ones(len(points), dtype=bool), tuple(parts)[1:])
+    found = Points(points, pixels, own, view, index, np.ones(len(points), dtype=bool), tuple(parts)[1:], rules)
     left_out = outliers("not a finite position with a positive sigma", lost)
     return Gathered(found, left_out, tuple(notes), sigmas is not None)
 
 
-def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarray, ...]]) -> str:
+def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarray, ...]], least: int) -> str:
     """Why a view cannot be used; empty when it can."""
-    least = RULES.least_corners
     if len(board) < least:
         return f"expected at least {least} points, found {len(board)}. Bring more of the board into the picture."
     for points, what in ((board, "on the board"), (image, "in the picture")):

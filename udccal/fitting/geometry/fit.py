@@ -20,7 +20,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
-from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, RULES, Bundle, centred, lens_alone
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, RULES, Bundle, GeometryRules, centred, lens_alone
 from udccal.fitting.geometry.calibrated import CalibratedViews, folded, turn_with
 from udccal.fitting.geometry.data import BoardView, GeometryData, gather
 from udccal.fitting.geometry.views import calibrate_views, check_picture
@@ -44,6 +44,7 @@ def fit_geometry(
     sigmas: Sequence[Float[np.ndarray, " _"]] | None = None,
     *,
     prior: Prior | None = None,
+    rules: GeometryRules = RULES,
 ) -> FitResult[Geometry]:
     """Fit the lens to views of flat boards, given as arrays; ``views.calibrate_views`` gives their poses as well.
 
@@ -59,6 +60,7 @@ def fit_geometry(
             lower minimum wins.
         sigmas: per view, one sigma in px of each point, up to a common factor; without it all points count alike.
         prior: on the intrinsics, in the order of ``INTRINSIC_NAMES``; with it a single view may be enough.
+        rules: see ``GeometryRules``.
 
     Returns:
         the term, without rotation and pupil, with estimates of the intrinsics. The order of the distortion is the one
@@ -67,14 +69,14 @@ def fit_geometry(
     Raises:
         FitError: when the arrays do not belong together.
     """
-    gathered = gather(board_points, image_points, sigmas)
+    gathered = gather(board_points, image_points, sigmas, rules)
     check_picture(image_size, gathered.points)
     lens = start or lens_alone(centred(float(max(image_size)), image_size))
     try:
         views = calibrate_views(gathered, image_size, start, prior)
     except FitError as error:
         return FitResult.failed("geometry", lens, FitStatus.TOO_FEW_DATA, str(error))
-    if views.rms_px > RULES.no_corners_px:
+    if views.rms_px > rules.no_corners_px:
         # No error bars hold for what is no lens.
         return FitResult.failed("geometry", lens, views.status, *views.notes)
     return _result(views, np.zeros(3), prior)
@@ -93,11 +95,11 @@ def fit_boards(data: GeometryData) -> FitResult[Geometry]:
         the term, with estimates of the intrinsics and of tilt, roll and yaw; the status says what to capture. With
         fewer than 3 views beside the parallel one it is ``TOO_FEW_DATA``: the prior then decides about the lens.
     """
-    usable = [view for view in data.views if view.usable()]
-    lost, status = tuple(_lost(data.views)), FitStatus.TOO_FEW_DATA
-    least, parallel = 1 if data.prior else RULES.least_views, sum(view.parallel for view in usable)
+    rules, usable = data.rules, [view for view in data.views if view.usable(data.rules)]
+    lost, status = tuple(_lost(data)), FitStatus.TOO_FEW_DATA
+    least, parallel = 1 if data.prior else rules.least_views, sum(view.parallel for view in usable)
     if len(usable) < least or not parallel:
-        if sum(view.clipped > RULES.most_clipped for view in data.views) > len(data.views) / 2:
+        if sum(view.clipped > rules.most_clipped for view in data.views) > len(data.views) / 2:
             status = FitStatus.SATURATED
         found = f"Expected {least} views with a board and one of them parallel to the panel, found {len(usable)} "
         return FitResult.failed("geometry", data.nominal, status, *lost, f"{found}and {parallel}.")
@@ -112,13 +114,13 @@ def fit_boards(data: GeometryData) -> FitResult[Geometry]:
         return FitResult.failed("geometry", data.nominal, status, *lost, *bundle.notes, *tilt)
     result = _result(bundle, np.asarray(data.nominal.pupil_mm, dtype=np.float64), data.prior, on_jig)
     left_out, sentences = _outliers(bundle, views)
-    poor = bundle.rms_px > RULES.worst_rms_px and bundle.chi2_dof > RULES.worst_chi2_dof
+    poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
     mounting = "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."
     by_hand = [k for k in range(len(views)) if k not in on_jig]
     few: tuple[str, ...] = ()
-    if len(by_hand) < RULES.least_views:
+    if len(by_hand) < rules.least_views:
         few = (
-            f"Expected at least {RULES.least_views} usable views of the board held by hand, found {len(by_hand)}: the "
+            f"Expected at least {rules.least_views} usable views of the board held by hand, found {len(by_hand)}: the "
             "rig description decides about the lens. Capture more, in varied poses.",
         )
     scatter = {
@@ -161,11 +163,11 @@ def projection_sigma_px(
 def _calibrated(views: Sequence[BoardView], data: GeometryData) -> tuple[CalibratedViews, Float[np.ndarray, " n"]]:
     """The bundle, and the scatter in addition to noise in px by axis: of all views, then of each in use."""
     points = [board_points_mm(view.spec)[view.corners.ids] for view in views]
-    seen, scatter_px = [view.corners.xy for view in views], np.full(1, RULES.start_scatter_px)
+    seen, scatter_px = [view.corners.xy for view in views], np.full(1, data.rules.start_scatter_px)
     for _ in range(8):
         # No lens follows its model more closely than a thousandth of a pixel.
         sigmas = [np.maximum(np.hypot(view.corners.sigma, scatter_px[0]), 1e-3) for view in views]
-        gathered = gather(points, seen, sigmas)
+        gathered = gather(points, seen, sigmas, data.rules)
         bundle = calibrate_views(gathered, data.image_size, data.nominal, data.prior)
         before, scatter_px = scatter_px, _scatter_px(bundle, views)
         if abs(scatter_px[0] - before[0]) <= 0.05 * before[0]:
@@ -188,13 +190,14 @@ def _scatter_px(bundle: CalibratedViews, views: Sequence[BoardView]) -> Float[np
     )
 
 
-def _lost(views: Sequence[BoardView]) -> Iterator[str]:
-    lost = [view.step_id for view in views if len(view.corners.ids) < RULES.least_corners]
-    clipped = [view.step_id for view in views if view.clipped > RULES.most_clipped]
+def _lost(data: GeometryData) -> Iterator[str]:
+    rules = data.rules
+    lost = [view.step_id for view in data.views if len(view.corners.ids) < rules.least_corners]
+    clipped = [view.step_id for view in data.views if view.clipped > rules.most_clipped]
     if lost:
-        yield f"No board (fewer than {RULES.least_corners} corners) in {', '.join(lost)}."
+        yield f"No board (fewer than {rules.least_corners} corners) in {', '.join(lost)}."
     if clipped:
-        yield f"More than {RULES.most_clipped:.0%} of the samples clipped in {', '.join(clipped)}."
+        yield f"More than {rules.most_clipped:.0%} of the samples clipped in {', '.join(clipped)}."
 
 
 def _result(
@@ -273,7 +276,7 @@ def _outliers(bundle: CalibratedViews, views: list[BoardView]) -> tuple[tuple[Ou
         ids = view.corners.ids[points.index[(points.view == k) & ~points.used]]
         places += [f"{view.step_id} corner {corner}" for corner in ids]
         if len(ids):
-            far = f"further than {RULES.corners.sigma:g} robust sigma of their view from the model"
+            far = f"further than {points.rules.corners.sigma:g} robust sigma of their view from the model"
             sentences.append(f"{view.step_id}: corners {', '.join(map(str, ids))} left out, {far}.")
-    found = RULES.corners.listed(places)
+    found = points.rules.corners.listed(places)
     return (*(other for other in bundle.outliers if all(other.rule != f.rule for f in found)), *found), tuple(sentences)

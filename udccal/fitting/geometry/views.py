@@ -25,7 +25,6 @@ from udccal.fitting.geometry.bundle import (
     EVERY,
     NOTHING_KNOWN,
     ORDERS,
-    RULES,
     Bundle,
     BundleProblem,
     Free,
@@ -69,12 +68,12 @@ def calibrate_views(
         FitError: with fewer than 3 usable views (1 with a prior).
     """
     check_picture(image_size, gathered.points)
-    least, known = (RULES.least_views, NOTHING_KNOWN) if prior is None else (1, prior)
-    given = gathered.points
+    given, rules = gathered.points, gathered.points.rules
+    least, known = (rules.least_views, NOTHING_KNOWN) if prior is None else (1, prior)
     if len(given.names) < least:
         found = f"{len(given.names) + len(gathered.notes)} views, {len(given.names)} of them usable"
         raise FitError(
-            f"Expected at least {least} views of at least {RULES.least_corners} points each, found {found}. "
+            f"Expected at least {least} views of at least {rules.least_corners} points each, found {found}. "
             f"{' '.join(gathered.notes)} Capture more views of the board."
         )
     robust, given, strange = _distinct(
@@ -102,7 +101,7 @@ def calibrate_views(
         pattern_px=pattern_px,
         status=FitStatus.CONVERGED if solved.converged else FitStatus.NOT_CONVERGED,
         notes=gathered.notes,
-        outliers=(*gathered.outliers, *strange, *RULES.corners.listed(places)),
+        outliers=(*gathered.outliers, *strange, *rules.corners.listed(places)),
         iterations=likely.solved.iterations,
         image_size=image_size,
     )
@@ -191,13 +190,13 @@ class _Search:
         The pose of a view with few points may fit them all: its scale is at least half of all views'. Its points stay
         where too few would be left to determine its pose.
         """
-        view, views = self.given.view, len(self.given.names)
+        view, views, rules = self.given.view, len(self.given.names), self.given.rules
         z = linearised(place, self.given)[0] / self.given.sigma[:, None]
         seen = np.where(used[:, None], z, np.nan)
         own = np.array([robust_sigma(seen[view == k]) for k in range(views)])
         scales = np.maximum(np.maximum(own, 0.5 * robust_sigma(seen)), _least_scale(self.given))
-        off = RULES.corners.off(z / scales[view, None]).any(axis=1)
-        return scales, ~off | (np.bincount(view[~off], minlength=views) < RULES.least_corners)[view]
+        off = rules.corners.off(z / scales[view, None]).any(axis=1)
+        return scales, ~off | (np.bincount(view[~off], minlength=views) < rules.least_corners)[view]
 
 
 def check_picture(image_size: object, points: Points) -> None:
@@ -225,7 +224,7 @@ def _distinct(
 ) -> tuple[_Fitted, Points, tuple[Outliers, ...]]:
     """The minimum of the views that are measurements of their own, those views, and what was left out."""
     robust, left_out = search(given), tuple[Outliers, ...]()
-    scatters = f"scatters more than {RULES.strange_view:g} times as much as the median view"
+    scatters = f"scatters more than {given.rules.strange_view:g} times as much as the median view"
     repeats = "repeats another's corners to within a fraction of their scatter: it is no new measurement"
     for rule, what in ((_strange, scatters), (_copies, repeats)):
         out = rule(robust, least)
@@ -244,7 +243,7 @@ def _distinct(
 
 def _strange(robust: _Fitted, least: int) -> Bool[np.ndarray, " views"]:
     """Views that scatter far more than the others, unless too few would be left."""
-    strange = robust.scales > RULES.strange_view * np.median(robust.scales)
+    strange = robust.scales > robust.points.rules.strange_view * np.median(robust.scales)
     return np.asarray(strange & bool((~strange).sum() >= least))
 
 
@@ -255,10 +254,10 @@ def _copies(robust: _Fitted, _: int) -> Bool[np.ndarray, " views"]:
     corners, copies = [{tuple(points.board[k]): k for k in mine} for mine in used], np.zeros(len(views), dtype=bool)
     for first, later in combinations(views, 2):
         common = corners[first].keys() & corners[later].keys()
-        if not copies[first] and len(common) >= RULES.least_corners:
+        if not copies[first] and len(common) >= points.rules.least_corners:
             a, b = np.array([(corners[first][at], corners[later][at]) for at in common]).T
             apart2 = ((points.image[a] - points.image[b]) ** 2).mean(axis=1).sum()
-            copies[later] |= apart2 < RULES.copy * (points.sigma[[a, b]] ** 2).sum()
+            copies[later] |= apart2 < points.rules.copy * (points.sigma[[a, b]] ** 2).sum()
     return copies
 
 
@@ -319,7 +318,7 @@ def _choose_order(full: _Fitted, prior: Prior) -> tuple[Choice[Solved], Float[np
     # p1 and p2 come together, at the price of one.
     pair = np.array(["p1 p2" in name for name in ORDERS])
     coefficients = np.array([free.sum() for free in ORDERS.values()]) - ORDERS["no distortion"].sum()
-    against = 2 * np.log(RULES.further_order) * (coefficients - pair)
+    against = 2 * np.log(points.rules.further_order) * (coefficients - pair)
     for price, (name, free) in reversed(list(zip(against, ORDERS.items(), strict=True))):
         if tried:
             above = Bundle(np.where(free, solved.place.intrinsics, 0.0), solved.place.poses)
@@ -329,7 +328,7 @@ def _choose_order(full: _Fitted, prior: Prior) -> tuple[Choice[Solved], Float[np
         criterion = bic(samples * float(np.log(noise)), float(parameters), samples) + float(price)
         tried.insert(0, Attempt(name, parameters, criterion, solved))
     known = np.diag(full.solved.equations.cov()) * np.diag(prior.precision)
-    if known[:4].max() > RULES.prior_share:
+    if known[:4].max() > points.rules.prior_share:
         return Choice(tried[-1], tuple(tried)), None
     orders = choose(tried)
     # Akaike's price of p1 and p2 is that of one, too: with that of both, a pair that is there has too little weight.
