@@ -26,10 +26,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
+from udccal.arguments import check_number, number_of
 from udccal.errors import FitError
 from udccal.models.arrays import Arrayish
 from udccal.models.noise import Noise, linear_signal
 
+# Numbers by sample and by pixel.
+Samples = Float[Arrayish, "n pixels"]
+Picture = Float[Arrayish, " pixels"]
 _PEAK = 0.3989422804  # of the normal density
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
 _LEAST_VARIANCE = 0.25
@@ -52,32 +56,23 @@ _LEAST_DARK: Final = -0.01
 @final
 @dataclass(frozen=True)
 class HdrRules:
-    """The constants of a merge.
+    """The constants of a merge; the comments say what each is."""
 
-    Attributes:
-        believed_sigma: a sample farther than this from the other samples of its pixel is a hit, clipped or not.
-        margin_sigma: samples count as clipped from this many sigma of dark noise below saturation on.
-        frame_off, frame_sigma: a frame is left out when its light is off by more than both (relative, and in sigma).
-        least_to_judge: the fewest samples of a pixel for finding hits and testing frames.
-        scatter_off: scatter of samples about their light, relative to the noise model's variance, that is too much.
-        sure_electrons: electrons that a pixel's light is worth before the scatter about it is judged.
-        black_off: error of the black level, in sigma of dark noise, that is too much.
-        bend_off: part of the signal at saturation, missing against shorter exposures, that is too much.
-        light_off: light of a frame that is off, in sigma of a full pixel, of which a note tells.
-        least_codes: codes above black from which neighbouring samples are rounded up as often as down: their light
-            differs by parts of a code, and its own noise smears the steps.
-    """
-
+    # A sample farther than this from the other samples of its pixel is a hit, clipped or not.
     believed_sigma: float = 6.0
+    # Samples count as clipped from this many sigma of dark noise below saturation on.
     margin_sigma: float = 6.0
+    # A frame is left out when its light is off by more than both (relative, and in sigma).
     frame_off: float = 0.02
     frame_sigma: float = 5.0
-    least_to_judge: int = 3
-    scatter_off: float = 0.05
-    sure_electrons: float = 100.0
-    black_off: float = 0.1
-    bend_off: float = 0.01
-    light_off: float = 0.25
+    least_to_judge: int = 3  # the fewest samples of a pixel for finding hits and testing frames
+    scatter_off: float = 0.05  # of the samples' variance about their light against the noise model's: too much
+    sure_electrons: float = 100.0  # that a pixel's light is worth before the scatter about it is judged
+    black_off: float = 0.1  # error of the black level, in sigma of dark noise, that is too much
+    bend_off: float = 0.01  # part of the signal at saturation, missing against shorter exposures, that is too much
+    light_off: float = 0.25  # light of a frame that is off, in sigma of a full pixel, of which a note tells
+    # Codes above black from which neighbouring samples are rounded up as often as down: their light differs by parts
+    # of a code, and its own noise smears the steps.
     least_codes: float = 2.0
 
 
@@ -101,12 +96,15 @@ class SensorNumbers(eqx.Module):
     @classmethod
     def of(cls, noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
         """The numbers of a noise model, times in units of ``unit_s``."""
-        K, black, saturation, sigma_d, q, dark, offset, bent = (_possible(noise, name) for name in _POSSIBLE)
+        found = {name: number_of(getattr(noise, name, None)) for name in _POSSIBLE}
+        for name, number in found.items():
+            check_number(number, f"a noise model whose {name} is a number", _POSSIBLE[name], "Fit the noise.", FitError)
+        K, black, saturation, sigma_d, q, dark, offset, bent = (float(np.asarray(one)) for one in found.values())
         if not saturation > black:
             raise FitError(f"Expected saturation above black, found {saturation:g} and {black:g} DN. Fit the noise.")
         if dark * unit_s < _LEAST_DARK * (saturation - black) / K:
-            found = f"found {dark:g} e/s, which is {dark * unit_s:.3g} e in the longest exposure"
-            raise FitError(f"Expected a dark current of about 0 or more, {found}. Fit the noise.")
+            all_e = f"{dark:g} e/s, which is {dark * unit_s:.3g} e in the longest exposure"
+            raise FitError(f"Expected a dark current of about 0 or more, found {all_e}. Fit the noise.")
         # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
         floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
         # The first harmonic of the codes' steps, as far as noise does not smear them.
@@ -116,33 +114,23 @@ class SensorNumbers(eqx.Module):
         level = linear_signal(saturation - black, bend) / K - rules.margin_sigma * floor**0.5
         return cls(black, 1 / K, dark * unit_s, floor, level, offset, rounding, below, bend)
 
-    def electrons(self, codes: Float[Arrayish, "n pixels"]) -> Float[Arrayish, "n pixels"]:
+    def electrons(self, codes: Samples) -> Samples:
         """Light of samples in e-, dark current included; the response's bend is taken out."""
-        signal: Float[Arrayish, "n pixels"] = linear_signal(codes - self.black_DN, self.bend_per_DN)
+        signal: Samples = linear_signal(codes - self.black_DN, self.bend_per_DN)
         return signal * self.e_per_DN
-
-
-def _possible(noise: Noise, name: str) -> float:
-    """A number of the noise model, which a sensor may have."""
-    value, (low, high) = getattr(noise, name, None), _POSSIBLE[name]
-    number = np.asarray(value)
-    if number.ndim or number.dtype.kind not in "fiu" or not low <= number <= high:
-        expected = f"Expected a noise model whose {name} is a number from {low:g} to {high:g}"
-        raise FitError(f"{expected}, found {value}. Fit the noise.")
-    return float(number)
 
 
 class BlockMerge(eqx.Module):
     """Rate and sigma in e-/s, number of unclipped samples, worst sample, and the square of its deviation in sigma."""
 
-    rate: Float[Arrayish, " pixels"]
-    sigma: Float[Arrayish, " pixels"]
+    rate: Picture
+    sigma: Picture
     used: Int[Arrayish, " pixels"]
     worst: Int[Arrayish, " pixels"]
-    deviation2: Float[Arrayish, " pixels"]
+    deviation2: Picture
 
 
-def _mills(z: Float[Arrayish, "n pixels"], xp: ModuleType) -> Float[Arrayish, "n pixels"]:
+def _mills(z: Samples, xp: ModuleType) -> Samples:
     """Density over upper tail of the normal distribution to 1e-3: Abramowitz and Stegun 7.1.26, from 5 on 26.2.12."""
     far = xp.maximum(z, 5.0)
     t = 1 / (1 + 0.23164189 * abs(z))
@@ -152,12 +140,7 @@ def _mills(z: Float[Arrayish, "n pixels"], xp: ModuleType) -> Float[Arrayish, "n
     return xp.where(z > 5, far + (1 - 2 / far**2) / far, near)
 
 
-def _bias_by_information(
-    z: Float[Arrayish, "n pixels"],
-    ratio: Float[Arrayish, "n pixels"],
-    scale: Float[Arrayish, "n pixels"],
-    xp: ModuleType,
-) -> Float[Arrayish, " pixels"]:
+def _bias_by_information(z: Samples, ratio: Samples, scale: Samples, xp: ModuleType) -> Picture:
     """Bias of the likeliest rate times its information; samples are censored at ``z`` sigma, ``scale`` is t / sigma.
 
     With U the score, it is -(E[U^3] + E[U U']) / 2 over the expected information, each a sum over the pixel's samples.
@@ -168,12 +151,7 @@ def _bias_by_information(
     return 0.5 * (scale**3 * density * (1 + z * (z - ratio))).sum(axis=0) / xp.maximum(information, _TINY)
 
 
-def _upward_deviance(
-    beyond: Float[Arrayish, "n pixels"],
-    mean: Float[Arrayish, "n pixels"],
-    variance: Float[Arrayish, "n pixels"],
-    xp: ModuleType,
-) -> Float[Arrayish, "n pixels"]:
+def _upward_deviance(beyond: Samples, mean: Samples, variance: Samples, xp: ModuleType) -> Samples:
     """Deviance of scaled counts of this variance and skewness: few electrons scatter more upwards than downwards."""
     scale = xp.maximum(mean / variance, 0.03)
     relative = xp.maximum(beyond * scale / variance, 0)
@@ -191,7 +169,7 @@ def merge_block(
     """Maximum-likelihood rates, computed by the functions of ``xp``, numpy or jax.numpy."""
     time = times[:, None]
 
-    def expected(rate: Float[Arrayish, " pixels"]) -> tuple[Float[Arrayish, "n pixels"], Float[Arrayish, "n pixels"]]:
+    def expected(rate: Picture) -> tuple[Samples, Samples]:
         mean = (rate + sensor.dark_e_per_s) * time
         return mean, xp.maximum(mean + sensor.floor_e2, _LEAST_VARIANCE * sensor.floor_e2)
 

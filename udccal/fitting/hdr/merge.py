@@ -20,6 +20,8 @@ from udccal.fitting.hdr.likelihood import BlockMerge, HdrRules, SensorNumbers, c
 from udccal.models.noise import Noise
 from udccal.result import FitStatus, Outliers
 
+# Pixels whose samples are judged, about.
+_JUDGED = 20_000
 # Sigma where no sample could be used: finite, and larger than any rate that a sensor can measure.
 UNKNOWN_SIGMA = 1e12
 # Pixels of a picture that is worth compiling for, and of one compiled pass, which stays in the processor's cache.
@@ -88,14 +90,14 @@ def merge_bracket(
         merged = bracket.merged()
     hits = bracket.mend_hits(merged)
     doubts = list(bracket.doubts(merged, unlike))
-    remarks = [] if doubts else list(bracket.unsteady(merged))
+    remarks = doubts or list(bracket.unsteady(merged))
     # In place: copies of a full frame would cost as much as a third of the merging.
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
     unknown = merged.used == 0
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
-    notes += [*doubts, *remarks]
+    notes += remarks
     rounded_below = 0.0
     if sensor.rounded_below_e > 0:
         rounded_below = float(sensor.rounded_below_e) / float(times[~bracket.dropped[:, 0]].max())
@@ -127,6 +129,10 @@ def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposur
     return times
 
 
+_Some = Float[np.ndarray, "n some"]
+_Used = Bool[np.ndarray, "n some"]
+
+
 @final
 @dataclass(frozen=True)
 class _Samples:
@@ -136,28 +142,38 @@ class _Samples:
     """
 
     times: Float[np.ndarray, "n 1"]
-    errors: Float[np.ndarray, "n some"]
-    mean: Float[np.ndarray, "n some"]
-    signal: Float[np.ndarray, "n some"]
-    variance: Float[np.ndarray, "n some"]
-    weight: Float[np.ndarray, "n some"]
-    clear: Bool[np.ndarray, "n some"]
+    errors: _Some
+    mean: _Some
+    signal: _Some
+    variance: _Some
+    weight: _Some
+    clear: _Used
 
-    def left(
-        self, deviation: Float[np.ndarray, "n some"], weight: Float[np.ndarray, "n some"]
-    ) -> Float[np.ndarray, "n some"]:
+    def bright(self, sigmas: float) -> _Used:
+        """The clear ones whose signal is more than so many of their sigmas."""
+        return self.clear & (sigmas * np.sqrt(self.variance) < self.signal)
+
+    def left(self, cause: Float[np.ndarray, "*k n some"], weight: _Some) -> Float[np.ndarray, "*k n some"]:
         """What of a deviation is left in the errors where each pixel's light, with these weights, follows it."""
         information = np.maximum((weight * self.times**2).sum(axis=0), 1e-30)
-        return np.asarray(deviation - self.times * (weight * self.times * deviation).sum(axis=0) / information)
+        followed = (weight * self.times * cause).sum(axis=-2, keepdims=True) / information
+        return np.asarray(cause - self.times * followed)
 
-    def amount(
-        self, left: Float[np.ndarray, "n some"], used: Bool[np.ndarray, "n some"], most_sigma: float
-    ) -> tuple[float, float]:
-        """How much of a deviation the errors have, by what is ``left`` of it, with its sigma; hits count as limits."""
-        sigma, weight = np.sqrt(self.variance), np.where(used, left / self.variance, 0.0)
-        information = max(float(np.sum(weight * left)), 1e-30)
-        errors = np.clip(self.errors, -most_sigma * sigma, most_sigma * sigma)
-        return float(np.sum(weight * errors)) / information, information**-0.5
+    def amounts(
+        self, left: Float[np.ndarray, "k n some"], used: _Used, most_sigma: float
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """How much of some deviations the errors have together, by what is ``left`` of them; hits count as limits.
+
+        The sigma of what these samples do not show is infinite.
+        """
+        sigma = np.sqrt(self.variance[used])
+        errors, left = np.clip(self.errors[used] / sigma, -most_sigma, most_sigma), left[:, used] / sigma
+        size = np.maximum(np.linalg.norm(left, axis=1), 1e-30)
+        left = left / size[:, None]
+        # All frames together have the light of the pixels, which is not known otherwise.
+        cov = np.linalg.pinv(left @ left.T, rcond=1e-9, hermitian=True)
+        own = np.diag(cov)
+        return cov @ (left @ errors) / size, np.where(own > 0, np.sqrt(np.maximum(own, 0.0)) / size, np.inf)
 
 
 @final
@@ -198,19 +214,20 @@ class _Bracket:
 
     def frames_off(self, merged: BlockMerge) -> Int[np.ndarray, " off"]:
         """Frames without any one of which the others agree, the best first; none where all agree."""
-        if not self._frame_scores(merged, self.rules.least_to_judge, 10.0).max() > self.rules.frame_sigma:
+        least, most = self.rules.least_to_judge, self.rules.frame_sigma
+        if not self._frame_scores(merged, least, 10.0).max() > most:
             return np.zeros(0, int)
         # The frame of most light sets the merged light: where it is wrong, the others are off. Each is left out once.
-        part, left = self.part(np.s_[:: max(1, self.codes.shape[1] // 20_000)]), np.full(len(self.times), np.inf)
+        part, left = self.part(np.s_[:: max(1, self.codes.shape[1] // _JUDGED)]), np.full(len(self.times), np.inf)
         for i in np.flatnonzero(~self.dropped).tolist():
             rest = part.without(i)
-            left[i] = rest._frame_scores(rest.merged(), self.rules.least_to_judge - 1, 10.0).max()
-        return np.argsort(left)[: max(1, int(np.sum(left <= self.rules.frame_sigma)))]
+            left[i] = rest._frame_scores(rest.merged(), least - 1, 10.0).max()
+        return np.argsort(left)[: max(1, int(np.sum(left <= most)))]
 
-    def _samples(self, merged: BlockMerge, least: int, least_rate: float = 0.0, most: int = 20_000) -> _Samples:
+    def _samples(self, merged: BlockMerge, least: int, least_rate: float = 0.0, most: int = _JUDGED) -> _Samples:
         """Of some pixels, about ``most``, with more than ``least_rate`` and at least so many samples."""
         sensor, pixels = self.sensor, np.flatnonzero((merged.used >= least) & (merged.rate > least_rate))
-        pixels = pixels[:: max(1, len(pixels) // max(min(most, 20_000), 1))]
+        pixels = pixels[:: max(1, len(pixels) // max(min(most, _JUDGED), 1))]
         light = np.asarray(sensor.electrons(self.codes[:, pixels].astype(np.float64)))
         times = self.times[:, None].astype(np.float64)
         signal = merged.rate[pixels] * times
@@ -228,11 +245,10 @@ class _Bracket:
         It is seen in samples of ``bright`` sigma and more, of pixels with at least so many samples.
         """
         seen, off, sigma = self._samples(merged, least), np.zeros(len(self.times)), np.full(len(self.times), np.inf)
-        clear = seen.clear & (bright * np.sqrt(seen.variance) < seen.signal)
-        for i in np.flatnonzero(clear.sum(axis=1) >= 8):
-            frame = (np.arange(len(off)) == i)[:, None]
-            left = seen.left(frame * seen.signal, seen.weight)
-            off[i], sigma[i] = seen.amount(left, clear, self.rules.believed_sigma)
+        used = seen.bright(bright)
+        for i in np.flatnonzero(used.sum(axis=1) >= 8):
+            frame = np.eye(len(off))[i, None, :, None] * seen.signal
+            (off[i],), (sigma[i],) = seen.amounts(seen.left(frame, seen.weight), used, self.rules.believed_sigma)
         return off, sigma
 
     def _frame_scores(self, merged: BlockMerge, least: int, bright: float) -> Float[np.ndarray, " n"]:
@@ -244,19 +260,13 @@ class _Bracket:
         """Part of the signal that is missing at saturation, whatever the light of each frame; 0 where it is little."""
         count = len(self.times)
         seen = self._samples(merged, 2, most=2_000_000 // count**2)
-        clear = seen.clear & (3.0 * np.sqrt(seen.variance) < seen.signal)
-        frames = np.eye(count)[:, :, None] * seen.signal
-        causes = (*frames, -(seen.signal**2) / float(self.sensor.level_e))
-        left = np.stack([seen.left(cause, seen.weight)[clear] for cause in causes])
-        errors, sigma = seen.errors[clear], np.sqrt(seen.variance[clear])
-        left, errors = left / sigma, np.clip(errors / sigma, -self.rules.believed_sigma, self.rules.believed_sigma)
-        size = np.maximum(np.sqrt(np.sum(left**2, axis=1)), 1e-30)
-        # All frames together have the light of the pixels, which is not known otherwise.
-        cov = np.linalg.pinv((left / size[:, None]) @ (left / size[:, None]).T, rcond=1e-9, hermitian=True)
-        found, own = float((cov @ (left @ errors / size))[-1] / size[-1]), float(np.sqrt(cov[-1, -1])) / float(size[-1])
+        bent = -(seen.signal**2) / float(self.sensor.level_e)
+        left = seen.left(np.concatenate([np.eye(count)[:, :, None] * seen.signal, bent[None]]), seen.weight)
+        off, sigma = seen.amounts(left, seen.bright(3.0), self.rules.believed_sigma)
         # The light of few electrons hardly tells it, and is itself too uncertain.
-        known = 0 < 2 * own < self.rules.bend_off
-        return found if known and abs(found) > max(self.rules.bend_off, self.rules.frame_sigma * own) else 0.0
+        known = 2 * sigma[-1] < self.rules.bend_off
+        most = max(self.rules.bend_off, self.rules.frame_sigma * sigma[-1])
+        return float(off[-1]) if known and abs(off[-1]) > most else 0.0
 
     def unsteady(self, merged: BlockMerge) -> Iterator[str]:
         """A sentence for light that differs between frames by too little to leave one out."""
@@ -341,8 +351,9 @@ class _Bracket:
         dark = seen.clear & (seen.mean < 30 * floor)
         # Light whose brighter samples are off themselves must not count.
         left = seen.left(np.ones_like(seen.mean), dark / seen.variance)
-        found, sigma = seen.amount(left, dark, self.rules.believed_sigma)
-        return found if abs(found) > max(self.rules.black_off * floor**0.5, 6 * sigma, self.sensor.rounding_e) else 0.0
+        (found,), (sigma,) = seen.amounts(left[None], dark, self.rules.believed_sigma)
+        least = max(self.rules.black_off * floor**0.5, 6 * sigma, self.sensor.rounding_e)
+        return float(found) if abs(found) > least else 0.0
 
 
 def _put(out: BlockMerge, where: slice | Int[np.ndarray, " some"], part: BlockMerge) -> None:
