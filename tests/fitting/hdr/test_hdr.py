@@ -338,6 +338,11 @@ def test_a_psf_of_doubted_brackets_says_so() -> None:
 def test_two_frames_that_differ_are_told_where_no_third_decides() -> None:
     frames = bracket(3e4, EXPOSURES[3:5], 9)
     exposures = EXPOSURES[3:5] * np.array([1.0, 1.2])
+    merge = merge_bracket(frames, exposures, NOISE)
+    assert merge.status is FitStatus.POOR_FIT
+    assert any("too few pixels have a third sample that tells which one is right" in note for note in merge.notes)
+    # The light of a pixel follows its only dark sample: nothing tells the black level.
+    assert not any("black level" in note for note in merge.notes)
     three = np.concatenate([frames, bracket(3e4, EXPOSURES[4:5], 10)])
     decided = merge_bracket(three, np.append(exposures, EXPOSURES[4]), NOISE)
     assert [o.places for o in decided.outliers] == [("frame 1",)]

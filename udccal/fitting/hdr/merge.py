@@ -157,7 +157,9 @@ class _Samples:
         """What of a deviation is left in the errors where each pixel's light, with these weights, follows it."""
         information = np.maximum((weight * self.times**2).sum(axis=0), 1e-30)
         followed = (weight * self.times * cause).sum(axis=-2, keepdims=True) / information
-        return np.asarray(cause - self.times * followed)
+        left = cause - self.times * followed
+        # Where the light follows it altogether, rounding leaves something.
+        return np.where(np.abs(left) > 1e-9 * np.abs(cause), left, 0.0)
 
     def amounts(
         self, left: Float[np.ndarray, "k n some"], used: _Used, most_sigma: float
