@@ -12,7 +12,7 @@ import numpy as np
 import udccal
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import sensor_map
-from udccal.fitting.wire.rules import WireRules, wire_start
+from udccal.fitting.wire.parameters import WireRules, wire_start
 from udccal.models.wire import wire_values
 
 LIGHT_E, FRAMES, PRNU = 9000.0, 100, 0.006

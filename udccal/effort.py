@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from udccal.fitting.psf.data import PsfRules
-from udccal.fitting.wire.rules import WireRules
+from udccal.fitting.wire.parameters import WireRules
 from udccal.result import Effort
 
 

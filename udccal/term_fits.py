@@ -24,7 +24,7 @@ from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.read import read_psf
 from udccal.fitting.wire.data import read_wire
 from udccal.fitting.wire.fit import fit_wire, sensor_map
-from udccal.fitting.wire.rules import WireRules
+from udccal.fitting.wire.parameters import WireRules
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise

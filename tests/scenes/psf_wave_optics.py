@@ -12,7 +12,7 @@ from tests.scenes.psf import DISC_PX, FLUX, Picture, Scene, noise_of, shots_of
 from udccal.cfa import cfa_named
 from udccal.fitting.psf.data import PsfData, PsfRules
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.wire.rules import ideal_wire, wire_start
+from udccal.fitting.wire.parameters import ideal_wire, wire_start
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import Wire

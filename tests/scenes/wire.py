@@ -12,8 +12,15 @@ from jaxtyping import Float
 
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire
-from udccal.fitting.wire.parameters import shape_sigma, shape_vector, with_shape
-from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible_harmonics
+from udccal.fitting.wire.parameters import (
+    WireRules,
+    WireStart,
+    ideal_wire,
+    possible_harmonics,
+    shape_sigma,
+    shape_vector,
+    with_shape,
+)
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map, wire_values
 from udccal.numerics import in_float64

@@ -20,7 +20,7 @@ from udccal.errors import ProfileError, SessionError
 from udccal.fitting.backscatter.read import read_backscatter
 from udccal.fitting.wire.data import read_wire
 from udccal.fitting.wire.fit import unusable_flat
-from udccal.fitting.wire.rules import WireRules
+from udccal.fitting.wire.parameters import WireRules
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
 from udccal.rig import RigDescription

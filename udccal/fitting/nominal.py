@@ -15,7 +15,7 @@ from udccal.fitting.backscatter.parameters import BackscatterRules
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.psf.data import PsfRules, group
 from udccal.fitting.psf.kernel import start_model
-from udccal.fitting.wire.rules import ideal_wire, wire_start
+from udccal.fitting.wire.parameters import ideal_wire, wire_start
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField

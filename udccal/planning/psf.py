@@ -22,7 +22,7 @@ from udccal.fitting.psf.data import PsfRules, Shots, held_out_positions
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice, start_model, start_prior
 from udccal.fitting.psf.problem import DiffractionProblem
 from udccal.fitting.psf.samples import Samples, choose_samples, gather, stands_for, weighed
-from udccal.fitting.wire.rules import ideal_wire, possible_harmonics, wire_start
+from udccal.fitting.wire.parameters import ideal_wire, possible_harmonics, wire_start
 from udccal.numerics import in_float64
 from udccal.planning.design import DESIGN_VARIABLES, Limits
 from udccal.planning.state import WHITE, RigState

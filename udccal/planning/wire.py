@@ -17,10 +17,16 @@ from udccal.arrangements import Dark, FlatLight
 from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.wire.data import Pixels, odd_step, sample_pixels
-from udccal.fitting.wire.fit import map_jacobian, mean_one
 from udccal.fitting.wire.jacobian import WireProblem, expected_of, with_harmonics
-from udccal.fitting.wire.parameters import Parameters, parameters_of
-from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics, wire_start
+from udccal.fitting.wire.map_error import map_jacobian, mean_one
+from udccal.fitting.wire.parameters import (
+    Parameters,
+    WireRules,
+    ideal_wire,
+    parameters_of,
+    possible_harmonics,
+    wire_start,
+)
 from udccal.numerics import in_float64
 from udccal.planning.design import Limits
 from udccal.planning.state import EvenField, RigState

@@ -37,8 +37,7 @@ from tests.scenes.wire import (
 from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.wire.data import odd_step
-from udccal.fitting.wire.parameters import SHAPE_NAMES, shape_sigma, shape_vector, with_shape
-from udccal.fitting.wire.rules import WireRules, WireStart
+from udccal.fitting.wire.parameters import SHAPE_NAMES, WireRules, WireStart, shape_sigma, shape_vector, with_shape
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
 from udccal.result import FitResult

@@ -25,7 +25,7 @@ from tests.scenes.wire import (
     places,
     start,
 )
-from udccal.fitting.wire.rules import WireStart
+from udccal.fitting.wire.parameters import WireStart
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.result import FitResult, FitStatus

@@ -11,7 +11,7 @@ from tests.benchmarks.growth.cases import Case
 from tests.scenes.wire import PRNU, SITES, geometry, start
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire
-from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
+from udccal.fitting.wire.parameters import WireRules, ideal_wire, possible_harmonics
 from udccal.models.geometry import Geometry
 from udccal.models.wire import wire_map
 from udccal.numerics import in_float64

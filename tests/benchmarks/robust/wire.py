@@ -8,7 +8,7 @@ import numpy as np
 
 from tests.benchmarks.robust.family import Answer, Case, Family, Number, of_result
 from tests.scenes.wire import PRNU, drawn_truth, fitted, geometry, map_at, map_sigma, noisy, places
-from udccal.fitting.wire.rules import WireStart
+from udccal.fitting.wire.parameters import WireStart
 
 
 def draw(seed: int) -> Case:

@@ -22,7 +22,7 @@ from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire
-from udccal.fitting.wire.rules import WireRules
+from udccal.fitting.wire.parameters import WireRules
 from udccal.models.noise import Noise
 from udccal.result import FitStatus
 

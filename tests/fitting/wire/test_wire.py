@@ -13,9 +13,8 @@ import pytest
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.wire.data import WireData, read_wire
-from udccal.fitting.wire.fit import fit_wire, sensor_map
-from udccal.fitting.wire.parameters import select
-from udccal.fitting.wire.rules import WireStart, wire_start
+from udccal.fitting.wire.fit import fit_wire, select, sensor_map
+from udccal.fitting.wire.parameters import WireStart, wire_start
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map, wire_values
 from udccal.result import FitResult, FitStatus

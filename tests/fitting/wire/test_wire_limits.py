@@ -33,7 +33,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.least_squares import LOG
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire
-from udccal.fitting.wire.rules import WireRules
+from udccal.fitting.wire.parameters import WireRules
 from udccal.models.wire import Wire, wire_map
 from udccal.result import FitResult, FitStatus
 

@@ -11,8 +11,8 @@ from tests.fitting.wire.test_wire_parts import GEOMETRY, even_pixels
 from tests.scenes.wire import start
 from udccal.fitting.wire.data import FlatNoise, weighed
 from udccal.fitting.wire.jacobian import expected_of
-from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
-from udccal.fitting.wire.weak import Omitted, Strengths, harmonics_alone, omitted, tied_sigma
+from udccal.fitting.wire.map_error import Omitted, Strengths, harmonics_alone, omitted, tied_sigma
+from udccal.fitting.wire.parameters import WireRules, ideal_wire, possible_harmonics
 from udccal.models.wire import Wire
 
 START, RULES = start(), WireRules()

@@ -22,7 +22,7 @@ from udccal.arguments import check_array, check_number, number_of
 from udccal.cfa import PATTERNS, cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import OutlierRule
-from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
+from udccal.fitting.wire.parameters import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, linear_signal
 from udccal.numerics import in_two_threads

@@ -7,33 +7,43 @@ to clip are left out; outliers are listed. A search on few pixels precedes one j
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from udccal.arguments import check_kind
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
-from udccal.fitting.engine.report import coarse
-from udccal.fitting.wire.columns import best_of_columns, likely_columns
-from udccal.fitting.wire.data import Pixels, WireData, flat_noise, pixels_at, sample_pixels
-from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, values_at, weighed_at
-from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
-from udccal.fitting.wire.report import Joint, misfits, rms, wire_result
-from udccal.fitting.wire.rules import SOLVER, WireRules, ideal_wire
-from udccal.fitting.wire.search import Descent, Found, Search
-from udccal.fitting.wire.weak import omitted, strengths_of, tied_sigma, unseen
-from udccal.models.geometry import Geometry
+from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
+from udccal.fitting.engine.report import estimates, priors_of, residual_sample
+from udccal.fitting.wire.data import BLOCK, Pixels, Weighed, WireData, flat_noise, sample_pixels
+from udccal.fitting.wire.jacobian import WireProblem, values_at, weighed_at
+from udccal.fitting.wire.map_error import (
+    MapJacobian,
+    Misfits,
+    Strengths,
+    map_jacobian,
+    mean_one,
+    misfits,
+    omitted,
+    rms,
+    strengths_of,
+    tied_sigma,
+    unseen,
+)
+from udccal.fitting.wire.parameters import SHAPE_NAMES, SOLVER, Kind, Parameters, WireRules, ideal_wire, parameters_of
+from udccal.fitting.wire.search import Descent, Search, best_of_columns, likely_columns
 from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
-from udccal.result import FitResult, FitStatus
+from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 
-# Places of the map's Jacobian, down and across.
-_PLACES = 64
+_ARRAYS = {Kind.SHADING: "baseline", Kind.AMPLITUDE: "amplitudes", Kind.FIELD: "fields"}
 
 
 @in_float64
@@ -75,16 +85,13 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
     off = misfits(tested, panel, jacobian.sigma(joint.cov), held_out, joint.variance, rules)
     if off.found:
         joint = replace(joint, cov=clustered_cov(joint.cov, joint.last.problem.sums(joint.x)[1] / joint.variance))
-    if joint.parameters.panel:
+    if panel is not None:
         missing = omitted(data.start, wire, joint.seen, rules)
         tied = tied_sigma(joint.strengths, wire, joint.seen, joint.variance)
         left_out = float(np.hypot(tied, missing.sigma if missing else 0.0))
     else:
-        left_out = unseen(search.harmonics, found.searched, rules)
-    model = float(np.hypot(off.sigma, left_out))
-    posterior = _posterior(joint, jacobian, model)
-    map_sigma, cov = jacobian.sigma_map(joint.cov, model), jacobian.cov_of_mean_one(joint.cov)
-    return wire_result(joint, cov, off, left_out, map_sigma, posterior, shape, rules)
+        left_out = unseen(search.harmonics, found.problem.pixels, rules)
+    return _result(joint, jacobian, off, left_out, shape, rules)
 
 
 @in_float64
@@ -111,93 +118,108 @@ def unusable_flat(data: WireData, rules: WireRules) -> tuple[FitStatus, str] | N
     return None
 
 
-def _joint(found: Found, every: Pixels, search: Search) -> Joint:
+@final
+@dataclass(frozen=True)
+class Selected:
+    """Columns that are kept, and the solution with them alone."""
+
+    keep: Bool[np.ndarray, " all"]
+    values: Float[np.ndarray, " all"]
+
+
+def select(
+    matrix: Float[np.ndarray, "all all"],
+    right: Float[np.ndarray, " all"],
+    power: float,
+    samples: int,
+    groups: Int[np.ndarray, " all"],
+) -> Choice[Selected]:
+    """Drop groups of columns, the weakest first, while that lowers BIC.
+
+    A group of k columns is kept when leaving it out raises chi-squared, in units of the residual variance of the full
+    model (so that PRNU counts as noise), by more than k ln(samples). Group -1 is always kept. ``power`` is the weighted
+    sum of the squared data. The result holds the full choice and the last steps to the best one.
+    """
+    unit = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    # The tiny ridge only decides between columns that the data cannot distinguish.
+    cov = np.linalg.inv(matrix / np.outer(unit, unit) + 1e-10 * np.eye(len(unit))) / np.outer(unit, unit)
+    values, keep, total = cov @ right, np.ones(len(right), dtype=bool), len(np.unique(groups[groups >= 0]))
+    variance = max((power - float(right @ values)) / max(samples - len(right), 1), 1e-300)
+    tried: list[Attempt[Selected]] = []
+    while True:
+        optional = np.unique(groups[keep & (groups >= 0)])
+        criterion = bic((power - float(right @ values)) / variance, float(keep.sum()), samples)
+        selected = Selected(keep, values)
+        tried.append(Attempt(f"{len(optional)} of {total} terms", int(keep.sum()), criterion, selected))
+        # The exact rise of chi-squared when one group is left out, by column.
+        inside = [np.flatnonzero(groups == group) for group in optional]
+        rises = [values[g] @ np.linalg.solve(cov[np.ix_(g, g)], values[g]) / len(g) / variance for g in inside]
+        if not rises or min(rises) >= np.log(samples):
+            return choose((tried[0], *tried[1:][-8:]))
+        weakest = inside[int(np.argmin(rises))]
+        gone = np.linalg.solve(cov[np.ix_(weakest, weakest)], cov[weakest])
+        # By Schur's complement, the inverse without these rows and columns.
+        values, cov = values - gone.T @ values[weakest], cov - cov[:, weakest] @ gone
+        values[weakest], cov[weakest], cov[:, weakest] = 0.0, 0.0, 0.0
+        keep = keep & (groups != groups[weakest[0]])
+
+
+@final
+@dataclass(frozen=True)
+class _Joint:
+    """A fitted wire: the search, the last descent, and the parameters' values and covariance.
+
+    ``variance`` is that of the residuals in units of the noise's, ``seen`` the pixels of the fit with their weights.
+    """
+
+    found: Descent
+    last: Descent
+    x: Float[np.ndarray, " n"]
+    cov: Float[np.ndarray, "n n"]
+    variance: float
+    seen: Weighed
+    orders: Choice
+    strengths: Strengths
+
+    @property
+    def parameters(self) -> Parameters:
+        """The parameters kept."""
+        return self.last.problem.parameters
+
+    @property
+    def impossible(self) -> bool:
+        """Whether an opening is wider than its period by more than three sigma."""
+        openings = np.flatnonzero(self.parameters.of(Kind.SHAPE))[7:9]
+        return bool(np.any(self.x[openings] - 1 > 3 * np.sqrt(np.diag(self.cov)[openings])))
+
+
+def _joint(found: Descent, every: Pixels, search: Search) -> _Joint:
     """Choose the columns that the data support, and fit them with the shape until the solver converges."""
-    descent, panel = found.descent, found.descent.problem.parameters.panel
-    start, noise, rules = search.data.start, search.noise, search.rules
-    bounds = search.harmonics.bounds if panel else ()
-    full = parameters_of(descent.wire, rules, descent.gains.size, bounds, panel)
-    prior, x = full.prior(start, rules), full.vector(descent.wire, descent.gains)
-    here = WireProblem("wire, orders", full, descent.weighs(every, noise), prior).equations_at(x)
+    panel, start, noise, rules = found.problem.parameters.panel, search.data.start, search.noise, search.rules
+    full = parameters_of(found.wire, rules, found.gains.size, search.harmonics.bounds if panel else (), panel)
+    prior, x = full.prior(start, rules), full.vector(found.wire, found.gains)
+    here = WireProblem("wire, orders", full, found.weighs(every, noise), prior).equations_at(x)
     # The equations are moved to where the columns are 0, so that the present coefficients count as the columns' own.
     already = np.where(full.groups >= 0, x - prior.mean, 0.0)
     right = here.right + here.shared @ already
     power = here.samples - len(x) + prior.cost(x) + float((here.right + right) @ already)
     orders = select(here.shared, right, power, here.samples, full.groups)
     chosen = orders.best.fit
-    strengths = strengths_of(full, here.shared, right, chosen)
+    strengths = strengths_of(full, here.shared, right, chosen.keep, chosen.values)
     kept, x = full.kept(chosen.keep), (x - already + chosen.values)[chosen.keep]
     problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, kept.prior(start, rules))
     # On the pixels of the search: by then, columns that are strong enough leave a single place.
-    searched, margin = descent.problem.pixels, rules.rival * descent.variance
-    others = likely_columns(descent.wire, descent.gains, searched, start.column_open, margin) if panel else []
-    solution, spread = best_of_columns(problem, minimise(problem, x, SOLVER), others)
+    others = likely_columns(found, found.problem.pixels, start, rules.rival * found.variance) if panel else []
+    last, spread = best_of_columns(Descent(problem, minimise(problem, x, SOLVER)), others)
+    solution = last.solution
     # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
     x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)
     seen = weighed_at(kept, x, every, noise)
-    cov, last = solution.with_rest(solution.equations.cov()) + spread, Descent(problem, solution)
-    return Joint(found, last, x, cov, problem.variance(float(seen.z @ seen.z)), seen, orders, strengths)
+    cov = solution.with_rest(solution.equations.cov()) + spread
+    return _Joint(found, last, x, cov, problem.variance(float(seen.z @ seen.z)), seen, orders, strengths)
 
 
-def _grid(geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]) -> Pixels:
-    """The middles of ``parts`` (down, across) of a sensor of that shape."""
-    y, x = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip(parts, shape, strict=True))
-    return pixels_at(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), geometry, shape)
-
-
-def mean_one(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> Float[np.ndarray, " n"]:
-    """``x`` with the first coefficient of the shading that gives the map a mean of 1, by the midpoint rule.
-
-    ``shape`` is the sensor's (rows, columns).
-    """
-    wire = parameters.wire(x)
-    whole, base = values_at(wire, _grid(wire.geometry, shape, (192, 256)))
-    scaled = x.copy()
-    scaled[0] -= np.log(float(np.mean(whole * base)))
-    return scaled
-
-
-@final
-@dataclass(frozen=True)
-class MapJacobian:
-    """Values of the map and their derivatives ``rows`` at a fixed mean of 1, on a grid over the sensor.
-
-    ``of_mean`` are the derivatives of the mean where it is not fixed.
-    """
-
-    value: Float[np.ndarray, " places"]
-    rows: Float[np.ndarray, "n places"]
-    of_mean: Float[np.ndarray, " n"]
-
-    def sigma_map(self, cov: Float[np.ndarray, "n n"], model: float = 0.0) -> Float32[np.ndarray, "1 16 16"]:
-        """Relative sigma of the map, RMS over 16 x 16 cells; ``model`` is the relative model error."""
-        variance = np.einsum("ip,ij,jp->p", self.rows, cov, self.rows, optimize=True) + (model * self.value) ** 2
-        return np.sqrt(coarse(variance.reshape(1, _PLACES, _PLACES), 16)).astype(np.float32)
-
-    def sigma(self, cov: Float[np.ndarray, "n n"], model: float = 0.0) -> float:
-        """Relative sigma of the map, RMS over the sensor; ``model`` is the relative model error."""
-        return rms(self.sigma_map(cov, model))
-
-    def cov_of_mean_one(self, cov: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-        """Covariance of the parameters where the first coefficient of the shading keeps the map's mean at 1."""
-        change = np.eye(len(cov))
-        change[0] -= self.of_mean
-        return np.asarray(change @ cov @ change.T)
-
-
-def map_jacobian(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> MapJacobian:
-    """Jacobian of the map at ``x``, whose mean is 1, on a grid of places over a sensor (rows, columns)."""
-    wire = parameters.wire(x)
-    grid = _grid(wire.geometry, shape, (_PLACES, _PLACES))
-    whole, base, rows = grid.by_block(lambda block: block_jacobian(parameters, wire, block))
-    value, rows = whole * base, rows * base
-    # Site gains are not in the map.
-    rows[parameters.of(Kind.SITE)] = 0.0
-    of_mean = rows.mean(axis=1)
-    return MapJacobian(value, rows - of_mean[:, None] * value, of_mean)
-
-
-def _posterior(joint: Joint, jacobian: MapJacobian, model: float) -> Posterior[Wire]:
+def _posterior(joint: _Joint, jacobian: MapJacobian, model: float) -> Posterior[Wire]:
     """Posterior of the fitted parameters and of the model error.
 
     The model error is a further modulation of unknown phase. Its cosine and sine are two more parameters, so that it
@@ -218,3 +240,136 @@ def _posterior(joint: Joint, jacobian: MapJacobian, model: float) -> Posterior[W
     factor[:size, :size] = square_root(joint.cov)
     factor[size:, size:] = model * np.eye(2)
     return Posterior(np.append(joint.x, [0.0, 0.0]), factor, term_at)
+
+
+def _result(
+    joint: _Joint, jacobian: MapJacobian, found: Misfits, left_out: float, shape: tuple[int, int], rules: WireRules
+) -> FitResult[Wire]:
+    """The result of a finished fit, on a sensor of that shape.
+
+    ``left_out`` is the relative part by harmonics that are tied or omitted, or by rows that may be there unseen, RMS
+    over the sensor.
+    """
+    seen, solution, model = joint.seen, joint.last.solution, float(np.hypot(found.sigma, left_out))
+    posterior, map_sigma = _posterior(joint, jacobian, model), jacobian.sigma_map(joint.cov, model)
+    term, outliers = _trimmed(posterior.term), seen.outliers(shape[1])
+    drawn = np.flatnonzero(seen.pixels.weight > 0)
+    mounted = Rotation.from_rotvec(term.geometry.rotation_rad)
+    turned = Rotation.from_rotvec(term.rotation_rad) * mounted
+    tilt, nominal = (np.rad2deg(np.arcsin(np.clip(one.as_matrix()[1, 2], -1.0, 1.0))) for one in (turned, mounted))
+    diagnostics = (
+        ("wire_map_rms_sigma", 100 * rms(map_sigma), "%"),
+        ("wire_map_model_sigma", 100 * model, "%"),
+        ("harmonics_left_out", 100 * left_out, "%"),
+        ("residual_pattern_p_value", found.pattern.test.p_value, "1"),
+        ("residual_lines_p_value", found.lines.test.p_value, "1"),
+        ("modulation_peak_to_peak", 100 * np.ptp(values_at(term, seen.pixels.thinned(8 * BLOCK))[0]), "%"),
+        ("harmonics", len(term.harmonics), "1"),
+        ("parameters", joint.parameters.linear, "1"),
+        ("pixels_left_out", sum(one.count for one in outliers), "1"),
+        ("gain_in_chi2", joint.found.gain, "1"),
+        ("tilt_by_wire", tilt, "deg"),
+        ("tilt_by_wire_minus_geometry", tilt - nominal, "deg"),
+        ("iterations", joint.found.solution.iterations + solution.iterations, "1"),
+    )
+    if joint.variance > rules.worst_variance or joint.impossible:
+        status = FitStatus.POOR_FIT
+    elif not joint.parameters.panel:
+        status = FitStatus.ABSENT
+    else:
+        status = FitStatus.CONVERGED if solution.converged else FitStatus.NOT_CONVERGED
+    named, cov = _estimates(joint, jacobian.cov_of_mean_one(joint.cov)) if joint.parameters.panel else ((), np.eye(0))
+    return FitResult(
+        name="wire",
+        term=term,
+        status=status,
+        estimates=named,
+        cov=cov,
+        chi2_dof=joint.variance,
+        samples=seen.pixels.used,
+        candidates=joint.orders.candidates,
+        diagnostics=tuple(Diagnostic(name, float(value), unit) for name, value, unit in diagnostics),
+        notes=tuple(_notes(joint, found, left_out, rules)),
+        outliers=outliers,
+        residuals=residual_sample((seen.pixels.scaled[drawn] + 1) / 2 * [shape[1] - 1, shape[0] - 1], seen.z[drawn]),
+        posterior=posterior,
+        map_sigma=map_sigma,
+    )
+
+
+def _trimmed(wire: Wire) -> Wire:
+    """The wire without unused Legendre degrees, amplitudes, and harmonics where there is no panel: it is faster."""
+    used = np.flatnonzero(np.any(wire.fields != 0, axis=(0, 1, 2)))
+    beside = wire.amplitudes if np.any(wire.amplitudes) else np.zeros((0, 2, 1, 1))
+    seen = np.s_[: len(wire.harmonics) if used.size or len(beside) else 0]
+    fields = wire.fields[seen, ..., : used.max(initial=0) + 1]
+    parts = {"harmonics": wire.harmonics[seen], "frequency": wire.frequency[seen], "fields": fields}
+    return replace(wire, amplitudes=beside, **parts)
+
+
+def _notes(joint: _Joint, found: Misfits, left_out: float, rules: WireRules) -> Iterator[str]:
+    if joint.parameters.panel:
+        prior = joint.last.problem.prior
+        off = (prior.root @ (joint.x - prior.mean))[joint.parameters.linear :]
+        if joint.found.sharpness < 1:
+            yield (
+                "The rows lack the higher harmonics of rectangular openings: row_open and column_open describe the "
+                "strength of the first harmonics, not edges that a microscope would show."
+            )
+        for name, sigmas in zip(SHAPE_NAMES, np.abs(off), strict=True):
+            if sigmas > rules.doubted_sigma:
+                yield f"{name} is {sigmas * rules.widening:.0f} tolerances away from the rig description; check it."
+    else:
+        yield "No modulation by rows is visible; the map is the shading alone."
+        if left_out > 0:
+            yield (
+                f"These flats are too noisy to tell: rows may modulate by {100 * left_out:.2g} % unseen, which "
+                "the sigmas include. Average more frames, or expose longer."
+            )
+    if (pattern := found.pattern).test.found:
+        yield (
+            f"The residuals are patterned (p = {pattern.test.p_value:.1g}): the model may be {100 * pattern.sigma:.3f} "
+            "% off, which the sigmas include."
+        )
+    if (lines := found.lines).test.found:
+        yield (
+            f"Columns or rows of the sensor differ by {100 * lines.sigma:.2g} % (p = {lines.test.p_value:.1g}), which "
+            "the map lacks and the sigmas include. Check the gains of the sensor's columns, and the light for stripes."
+        )
+    if joint.impossible:
+        yield "An opening came out wider than its period: check panel, pitch and lens in the rig description."
+    if joint.variance > rules.worst_variance:
+        yield (
+            "Look at the residual map for dust, glare or uneven light; check PRNU and the rig description. The sigmas "
+            f"take all {100 * found.excess:.2g} % by which residuals exceed noise for an error of the map."
+        )
+    elif not joint.last.solution.converged:
+        yield "Capture more flats, or give the fit more pixels."
+
+
+def _estimates(joint: _Joint, cov: Float[np.ndarray, "a a"]) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
+    """The shape, then all elements of the wire's arrays that were fitted, with their covariance."""
+    parameters, prior = joint.parameters, joint.last.problem.prior
+    # Gains of the CFA sites are not in the term: their errors remain in the variances of the others.
+    others = np.flatnonzero(~parameters.of(Kind.SITE) & ~parameters.of(Kind.SHAPE))
+    order = np.concatenate([np.flatnonzero(parameters.of(Kind.SHAPE)), others])
+    places = (
+        (_ARRAYS[Kind(kind)], index[2:] if kind == Kind.SHADING else index)
+        for kind, *index in parameters.columns[others].tolist()
+    )
+    names = (*SHAPE_NAMES, *(".".join(map(str, (array, *index))) for array, index in places))
+    (values, unit), (known, wide) = _in_units(joint.x[order]), _in_units(prior.mean[order])
+    sigma = prior.sigma[order] * wide
+    # Places have no origin beforehand.
+    values[4:6], sigma[4:6] = values[4:6] % 1.0, np.inf
+    cov = cov[np.ix_(order, order)] * np.outer(unit, unit)
+    return estimates("wire", names, values, cov, priors_of(names, known, sigma)), cov
+
+
+def _in_units(x: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Values from the fit's own parameters, of which the shape is first, and their derivatives by these."""
+    values, unit = x.copy(), np.ones(len(x))
+    # The fit's own are radians and, for stand-off and pupil, logarithms.
+    values[[3, 6]] = unit[[3, 6]] = np.exp(values[[3, 6]])
+    values[:3], unit[:3] = np.rad2deg(values[:3]), 180 / np.pi
+    return values, unit

@@ -49,12 +49,10 @@ class Rays(NamedTuple):
     ellipse: Float[Arrayish, "3 *n"]
 
 
-class Derivatives(NamedTuple):
-    """At each pixel: 1 + modulation, exp(B), and derivatives by ``shape_vector`` relative to exp(B)."""
-
-    whole: Float[Arrayish, " n"]
-    base: Float[Arrayish, " n"]
-    shape: Float[Arrayish, "10 n"]
+# Traced numbers of the pixels of a block.
+_Each = Float[Array, " n"]
+# Parameters, or a number of each pixel.
+_Numbers = Float[np.ndarray, " n"]
 
 
 def _rays(shape: Float[Array, "10"], mounted: Float[Arrayish, "3"], ideal: Float[Arrayish, "n 2"]) -> Rays:
@@ -96,18 +94,18 @@ def with_harmonics(
     return replace(wire, harmonics=harmonics, frequency=frequency, fields=fields)
 
 
-def values_at(wire: Wire, pixels: Pixels) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def values_at(wire: Wire, pixels: Pixels) -> tuple[_Numbers, _Numbers]:
     """1 + modulation and exp(B), whose product is the map."""
     filled = _filled(wire)
     whole, opened = pixels.by_block(lambda block: _values(filled, block))
     return whole, _base(wire, opened, pixels.scaled)
 
 
-def wire_derivatives(wire: Wire, pixels: Pixels) -> Derivatives:
-    """Values and derivatives at pixels."""
+def wire_derivatives(wire: Wire, pixels: Pixels) -> tuple[_Numbers, _Numbers, Float[np.ndarray, "10 n"]]:
+    """1 + modulation and exp(B), and derivatives by ``shape_vector`` relative to exp(B)."""
     filled = _filled(wire)
-    found = pixels.by_block(lambda block: _derivatives(filled, block))
-    return found._replace(base=_base(wire, found.base, pixels.scaled))
+    whole, opened, by_shape = pixels.by_block(lambda block: _derivatives(filled, block))
+    return whole, _base(wire, opened, pixels.scaled), by_shape
 
 
 _Filled = tuple[Wire, Float[Arrayish, "10"], Int[Arrayish, ""]]
@@ -123,8 +121,7 @@ def _filled(wire: Wire) -> _Filled:
     return jax.tree.map(jnp.asarray, filled), shape_vector(wire), np.asarray(count)
 
 
-_Factors = tuple[Float[Array, " n"], tuple[Float[Array, " n"], ...], tuple[Float[Array, " n"], ...]]
-_Carried = tuple[list[Float[Array, " n"]], _Factors]
+_Factors = tuple[_Each, tuple[_Each, _Each, _Each], tuple[_Each, _Each]]
 
 
 class _Harmonic(NamedTuple):
@@ -147,60 +144,51 @@ class _Harmonic(NamedTuple):
         sine, cosine = sine_cosine(2 * jnp.pi * (n * x + m * y))
         return kappa, (g, slope, -z * z * g - 2.0 * slope), (cosine, sine)
 
-    def powers(self, kappa: Float[Array, " n"]) -> Float[Array, "degrees n"]:
+    def powers(self, kappa: _Each) -> Float[Array, "degrees n"]:
         """Legendre polynomials of kappa, scaled to its range."""
         return legendre((kappa - self.frequency[0]) / self.frequency[1], self.fields.shape[-1])
 
-    def slits(self) -> tuple[list[Float[Array, " n"]], list[Float[Array, " n"]]]:
+    def slits(self) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"]]:
         """Coefficients 2 sin(pi m f) / (pi m f) along X and Y, 1 where m is 0, and their derivatives by f."""
-        values, slopes = [], []
-        for order, width in zip(jnp.abs(self.order), self.rays.openings, strict=True):
-            half_turns = jnp.pi * jnp.maximum(order, 1.0) * width
-            sine, cosine = sine_cosine(half_turns)
-            sinc = sine / half_turns
-            values.append(jnp.where(order == 0, 1.0, 2.0 * sinc))
-            slopes.append(jnp.where(order == 0, 0.0, 2.0 * (cosine - sinc) / width))
-        return values, slopes
+        order, width = jnp.abs(self.order)[:, None], self.rays.openings
+        half_turns = jnp.pi * jnp.maximum(order, 1.0) * width
+        sine, cosine = sine_cosine(half_turns)
+        sinc = sine / half_turns
+        # cos(nX) cos(mY) is half the sum over (n, m) and (-n, m): the coefficients along X have that half.
+        half = jnp.stack([jnp.where(jnp.all(order != 0), jnp.float32(0.5), jnp.float32(1.0)), jnp.float32(1.0)])[
+            :, None
+        ]
+        slopes = jnp.where(order == 0, 0.0, 2.0 * (cosine - sinc) / width)
+        return half * jnp.where(order == 0, 1.0, 2.0 * sinc), half * slopes
 
-    def waved(
-        self,
-        series: Float[Array, "degrees n"],
-        pupil: tuple[Float[Array, " n"], ...],
-        wave: tuple[Float[Array, " n"], ...],
-    ) -> Float[Array, " n"]:
+    def waved(self, series: Float[Array, "degrees n"], pupil: tuple[_Each, ...], wave: tuple[_Each, _Each]) -> _Each:
         """The wave by the field coefficients, whose degrees have these series and whose carriers are of the pupil."""
-        total = jnp.zeros_like(wave[0])
-        for by_carrier, part in zip(self.fields, wave, strict=True):
-            for by_degree, carrier in zip(by_carrier, pupil, strict=True):
-                total += sum(one * power for one, power in zip(by_degree, series, strict=True)) * carrier * part
-        return self.crossed() * total
+        return sum(
+            sum(one * power for one, power in zip(by_degree, series, strict=True)) * carrier * part
+            for by_carrier, part in zip(self.fields, wave, strict=True)
+            for by_degree, carrier in zip(by_carrier, pupil, strict=True)
+        )
 
-    def crossed(self) -> Float[Array, ""]:
-        """cos(nX) cos(mY) is half the sum over (n, m) and (-n, m)."""
-        return jnp.where(jnp.all(self.order != 0), jnp.float32(0.5), jnp.float32(1.0))
-
-    def value(self) -> Float[Array, " n"]:
+    def value(self) -> _Each:
         """Its part of the modulation."""
         kappa, pupil, wave = self.factors()
-        (slit_x, slit_y), _ = self.slits()
+        slit_x, slit_y = self.slits()[0]
         return self.waved(self.powers(kappa), pupil[:2], wave) * slit_x * slit_y
 
-    def derivatives(self, factors: _Factors) -> tuple[Float[Array, " n"], ...]:
+    def derivatives(self, factors: _Factors) -> tuple[_Each, ...]:
         """Its part of the modulation, and derivatives by periods, openings, ellipse and the pupil's logarithm."""
-        (n, m), (kappa, pupil, (cosine, sine)) = self.order, factors
+        (n, m), (kappa, pupil, wave) = self.order, factors
         ((slit_x, slit_y), (slope_x, slope_y)), powers = self.slits(), self.powers(kappa)
-        both = slit_x * slit_y
-        along = self.waved(powers, pupil[:2], (cosine, sine))
+        both, (cosine, sine) = slit_x * slit_y, wave
+        along = self.waved(powers, pupil[:2], wave)
         by_phase = 2 * jnp.pi * both * self.waved(powers, pupil[:2], (-sine, cosine))
-        by_log_z = both * self.waved(powers, pupil[1:], (cosine, sine))
+        by_log_z = both * self.waved(powers, pupil[1:], wave)
         # The corrections to the pupil's transform are themselves series in kappa; P'_k = P'_(k-2) + (2 k - 1) P_(k-1).
         bent = [jnp.zeros_like(kappa), jnp.ones_like(kappa)]
         for k in range(2, len(powers)):
             bent.append(bent[k - 2] + (2 * k - 1) * powers[k - 1])
-        by_kappa = (
-            by_log_z / kappa
-            + both * self.waved(jnp.stack(bent[: len(powers)]), pupil[:2], (cosine, sine)) / self.frequency[1]
-        )
+        by_series = both * self.waved(jnp.stack(bent[: len(powers)]), pupil[:2], wave) / self.frequency[1]
+        by_kappa = by_log_z / kappa + by_series
         by_ellipse = (part * by_kappa / kappa for part in (n * n / 2, n * m, m * m / 2))
         by_openings = along * slope_x * slit_y, along * slope_y * slit_x
         return along * both, n * by_phase, m * by_phase, *by_openings, *by_ellipse, by_log_z
@@ -216,9 +204,9 @@ def _harmonics(wire: Wire, rays: Rays) -> Callable[[Int[Array, ""]], _Harmonic]:
     return lambda h: _Harmonic(orders[h], frequency[h], fields[h], footprint, rays)
 
 
-# With the openings alone in place of exp(B), which needs no compiled code.
+# The openings alone stand in place of exp(B), which needs no compiled code.
 @jax.jit
-def _values(filled: _Filled, block: Pixels) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def _values(filled: _Filled, block: Pixels) -> tuple[_Each, _Each]:
     wire, shape, count = filled
     rays = _rays(shape, wire.geometry.rotation_rad, block.ideal)
     harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(block.ideal), jnp.float32)
@@ -227,13 +215,13 @@ def _values(filled: _Filled, block: Pixels) -> tuple[Float[Array, " n"], Float[A
 
 
 @jax.jit
-def _derivatives(filled: _Filled, block: Pixels) -> Derivatives:
+def _derivatives(filled: _Filled, block: Pixels) -> tuple[_Each, _Each, Float[Array, "10 n"]]:
     wire, shape, count = filled
     mounted = wire.geometry.rotation_rad
     rays = _rays(shape, mounted, block.ideal)
     harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(block.ideal), jnp.float32)
 
-    def added(h: Int[Array, ""], carried: _Carried) -> _Carried:
+    def added(h: Int[Array, ""], carried: tuple[list[_Each], _Factors]) -> tuple[list[_Each], _Factors]:
         sums, factors = carried
         more = harmonic(h).derivatives(factors)
         # What the loop carries is computed once. Otherwise each sum would compute the factors anew.
@@ -249,10 +237,10 @@ def _derivatives(filled: _Filled, block: Pixels) -> Derivatives:
     moved = jnp.concatenate(jax.jacfwd(_rays)(shape, mounted, block.ideal))
     # The pupil acts on the harmonics alone.
     by_shape = jnp.einsum("kn,knp->pn", by_ray, moved).at[6].add(sums[8])
-    return Derivatives(whole, rays.openings.prod(axis=0), by_shape)
+    return whole, rays.openings.prod(axis=0), by_shape
 
 
-def _beside(wire: Wire, rays: Rays, scaled: Float[Arrayish, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "2 n"]]:
+def _beside(wire: Wire, rays: Rays, scaled: Float[Arrayish, "n 2"]) -> tuple[_Each, Float[Array, "2 n"]]:
     """Modulation by the first harmonics' amplitudes that no pupil explains, and its derivatives by periods."""
     strongest, _, count_y, count_x = jnp.shape(wire.amplitudes)
     in_x, in_y = legendre(scaled[:, 0], count_x), legendre(scaled[:, 1], count_y)
@@ -263,7 +251,7 @@ def _beside(wire: Wire, rays: Rays, scaled: Float[Arrayish, "n 2"]) -> tuple[Flo
     return (cos * cosine + sin * sine).sum(axis=0), 2 * jnp.pi * some.harmonics.T @ (sin * cosine - cos * sine)
 
 
-def _base(wire: Wire, opened: Float[np.ndarray, " n"], scaled: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+def _base(wire: Wire, opened: _Numbers, scaled: Float[np.ndarray, "n 2"]) -> _Numbers:
     """exp(B): the shading times the openings."""
     in_x, in_y = np.polynomial.legendre.legvander(scaled.T, len(wire.baseline) - 1)
     return np.exp(((in_y @ wire.baseline) * in_x).sum(axis=1)) * opened
@@ -279,30 +267,30 @@ def _linear(
 
     def factors(h: Int[Array, ""]) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"], Float[Array, "degrees n"]]:
         one = harmonic(h)
-        (kappa, pupil, wave), (slits, _) = one.factors(), one.slits()
-        return jnp.stack(wave), one.crossed() * slits[0] * slits[1] * jnp.stack(pupil[:2]), one.powers(kappa)
+        kappa, pupil, wave = one.factors()
+        return jnp.stack(wave), one.slits()[0].prod(axis=0) * jnp.stack(pupil[:2]), one.powers(kappa)
 
     return jax.lax.map(factors, few)
 
 
-def expected_of(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Float[np.ndarray, " n"]:
+def expected_of(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> _Numbers:
     """The signal of a sample by the model, in CFA-balanced units."""
     whole, base = values_at(wire, pixels)
     return whole * base * gains[pixels.site]
 
 
-def weighed_at(parameters: Parameters, x: Float[np.ndarray, " n"], pixels: Pixels, noise: FlatNoise) -> Weighed:
+def weighed_at(parameters: Parameters, x: _Numbers, pixels: Pixels, noise: FlatNoise) -> Weighed:
     """A sample weighted by the wire and the gains of these parameters."""
     return weighed(pixels, expected_of(parameters.wire(x), parameters.gains(x), pixels), noise)
 
 
 def block_jacobian(
     parameters: Parameters, wire: Wire, block: Pixels
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "parameters n"]]:
+) -> tuple[_Numbers, _Numbers, Float[np.ndarray, "parameters n"]]:
     """1 + modulation, exp(B), and derivatives by the parameters relative to exp(B) and the gain, for one block."""
     filled = _filled(wire)
     whole, opened, by_shape = map(np.asarray, _derivatives(filled, block))
-    in_x, in_y = np.polynomial.legendre.legvander(block.scaled.T, np.shape(wire.baseline)[0] - 1).transpose(0, 2, 1)
+    in_x, in_y = np.polynomial.legendre.legvander(block.scaled.T, len(wire.baseline) - 1).transpose(0, 2, 1)
     # The baseline acts on everything: the change of exp(B) (1 + M), relative to exp(B), is (1 + M) dB.
     _, _, degree_y, degree_x = parameters.indices(Kind.SHADING)
     rows = [in_y[degree_y] * in_x[degree_x] * whole]
@@ -335,7 +323,7 @@ class WireProblem:
     pixels: Pixels
     prior: Prior
 
-    def equations_at(self, place: Float[np.ndarray, " n"]) -> Blocks:
+    def equations_at(self, place: _Numbers) -> Blocks:
         """Cost and normal equations in units of the residual variance."""
         matrix, by_tile, chi2 = self.sums(place)
         used, variance = self.pixels.used, self.variance(chi2)
@@ -347,9 +335,7 @@ class WireProblem:
         """Variance of the residuals in units of the noise's."""
         return chi2 / max(self.pixels.used - len(self.prior.mean), 1) + LEAST_VARIANCE
 
-    def sums(
-        self, place: Float[np.ndarray, " n"]
-    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
+    def sums(self, place: _Numbers) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
         """Information by the pixels' weights, the right side by tile, and chi-squared."""
         wire, gains, tiles = self.parameters.wire(place), self.parameters.gains(place), np.arange(TILES[0] * TILES[1])
 
@@ -363,7 +349,7 @@ class WireProblem:
         matrices, by_tile, chi2 = zip(*in_two_threads(of, self.pixels.blocks()), strict=True)
         return np.sum(matrices, axis=0), np.sum(by_tile, axis=0), float(np.sum(chi2))
 
-    def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
+    def moved(self, place: _Numbers, step: Step) -> _Numbers:
         """The place after a step."""
         return place + step.shared
 

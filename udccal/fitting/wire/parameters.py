@@ -1,4 +1,4 @@
-"""The parameters of a wire fit: which numbers of a wire they are, and which of these the data support."""
+"""What a wire fit solves for, and what it knows beforehand: its constants, the rig as built, parameters and prior."""
 
 from __future__ import annotations
 
@@ -12,9 +12,153 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
-from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire
-from udccal.models.wire import Wire
+from udccal.fitting.engine.least_squares import SolverRules
+from udccal.models.geometry import Geometry
+from udccal.models.wire import HIGHEST_ORDER, Wire
+from udccal.rig import RigDescription
+
+# Weakly determined parameters may creep on for ever: the descent ends at a tenth of a sigma, or when steps stall.
+SOLVER = SolverRules(least_gain=1e-2, stalled_gain=0.1)
+
+
+@final
+@dataclass(frozen=True)
+class WireRules:
+    """The constants of a wire fit; the comments say what each is."""
+
+    samples: int = 300_000  # pixels of the joint fit; time grows with it, the map's sigma falls with its square root
+    # Parts of ``samples`` for the search of the shape and for its first full fit, and the harmonics of the search.
+    search_part: float = 1 / 15
+    shape_part: float = 1 / 6
+    search_harmonics: int = 24
+    least_samples: int = 4000  # fewest pixels of a flat
+    most_clipped: float = 0.05  # part of the flat's pixels that may be clipped
+    headroom_sigma: float = 5.0  # distance of single frames from saturation; with less, their average is not linear
+    rotation_sigma_rad: float = 0.04  # prior sigma of the rotation about the geometry's own
+    widening: float = 2.0  # the prior's sigma in units of the rig's tolerances, which are bounds of a careful build
+    # Prior sigma of free amplitudes, and of relative changes of the pupil's transform.
+    amplitude_sigma: float = 0.05
+    field_sigma: float = 0.5
+    # Relative size from which harmonics are fitted, and from which the others count in the map's sigma.
+    least_amplitude: float = 3e-5
+    least_counted: float = 1e-6
+    # Relative sizes from which a harmonic may have many or few corrections to the round pupil.
+    strong: tuple[float, float] = (2e-3, 2e-4)
+    # Of the shading: degrees up to the first are always fitted, those up to the second if supported.
+    smooth_degrees: tuple[int, int] = (4, 8)
+    # Of stand-off and of pupil, relative to the rig description: a quotient of lengths, each 20 % off.
+    scan_range: tuple[float, float] = (0.64, 1.56)
+    # Of the stand-off in periods at the edge of the field, and of the pupil in radians of z, its transform's argument.
+    scan_steps: tuple[float, float] = (0.06, 0.8)
+    places: int = 5  # most places of the scan from which descents start
+    sharpness: tuple[float, ...] = (1.0, 0.5, 0.0)  # of the openings' edges, to try; see ``with_harmonics``
+    # Difference in minus twice the log posterior below which places may change their order with more pixels, and
+    # below which they may after the first steps.
+    rival: float = 60.0
+    unfinished: float = 400.0
+    # Residual variance beyond which free amplitudes, which no pupil explains, are tried: of so many harmonics, and of
+    # so many degrees over the sensor.
+    doubtful_variance: float = 1.15
+    free: tuple[int, int] = (3, 3)
+    least_gain: float = 100.0  # chi-squared that rows must explain; chance does not reach a third of it in 300 trials
+    worst_variance: float = 2.0  # beyond it the fit is poor: model error is as strong as shot noise and PRNU
+    doubted_sigma: float = 3.0  # deviation in prior sigmas beyond which the rig description is doubted
+
+
+@final
+@dataclass(frozen=True)
+class WireStart:
+    """The rig as built, lengths in panel periods. Tolerances of stand-off and pupil are relative, others absolute."""
+
+    standoff_per_pitch: float
+    standoff_tolerance: float
+    footprint_per_pitch: float
+    pupil_tolerance: float
+    row_open: float
+    row_tolerance: float
+    column_open: float
+    column_tolerance: float
+    depth_per_pitch: float
+    depth_tolerance: float
+
+
+def wire_start(rig: RigDescription) -> WireStart:
+    """The start values of a wire fit by a rig's panel, lens and stand-off."""
+    panel, lens, standoff = rig.panel, rig.lens, rig.mounting.standoff_mm
+    pitch, depth = panel.pitch_mm.value, panel.depth_mm
+    pitch_tolerance = panel.pitch_mm.tolerance / pitch
+    lens_tolerance = lens.focal_mm.tolerance / lens.focal_mm.value + lens.f_number.tolerance / lens.f_number.value
+    return WireStart(
+        standoff_per_pitch=standoff.value / pitch,
+        standoff_tolerance=standoff.tolerance / standoff.value + pitch_tolerance,
+        # The beam narrows a little from the pupil to the panel on its way to the focus distance.
+        footprint_per_pitch=rig.pupil_diameter_mm * (1 - standoff.value / lens.focus_mm) / pitch,
+        pupil_tolerance=lens_tolerance + pitch_tolerance,
+        row_open=panel.row_open.value,
+        row_tolerance=panel.row_open.tolerance,
+        column_open=panel.column_open.value,
+        column_tolerance=panel.column_open.tolerance,
+        depth_per_pitch=depth.value / pitch,
+        depth_tolerance=depth.tolerance / pitch,
+    )
+
+
+@final
+@dataclass(frozen=True)
+class Harmonics:
+    """Whole numbers (n, m), and the bound of each one's relative amplitude, largest first."""
+
+    orders: Float[np.ndarray, "harmonics 2"]
+    bounds: Float[np.ndarray, " harmonics"]
+
+
+def possible_harmonics(start: WireStart, least: float = WireRules.least_amplitude, below: float = np.inf) -> Harmonics:
+    """Harmonics whose relative amplitude has a bound from ``least`` (by default the fitted ones') to ``below``.
+
+    The bound is the slits' times the envelope of 2 J1(z) / z, z = pi D kappa / pitch, for a round pupil.
+    """
+    orders = np.arange(HIGHEST_ORDER + 1.0)
+    m, n = (part.ravel() for part in np.meshgrid(orders, np.concatenate([-orders[:0:-1], orders]), indexing="ij"))
+    n, m = n[(m > 0) | (n > 0)], m[(m > 0) | (n > 0)]
+    z = np.pi * start.footprint_per_pitch * np.hypot(n, m)
+    size = np.where((n != 0) & (m != 0), 0.5, 1.0) * np.minimum(1.0, 2 * np.sqrt(2 / np.pi) / z**1.5)
+    for order, opening in ((m, start.row_open), (np.abs(n), start.column_open)):
+        slit = np.minimum(2.0 / (np.pi * np.maximum(order, 1) * opening), 2.0 * (1 - opening) / opening)
+        size = size * np.where(order == 0, 1.0, slit)
+    found = [i for i in np.argsort(-size, kind="stable") if least <= size[i] < below]
+    return Harmonics(np.stack([n[found], m[found]], axis=1), size[found])
+
+
+def ideal_wire(
+    geometry: Geometry, start: WireStart, harmonics: Float[np.ndarray, "harmonics 2"], rules: WireRules | None = None
+) -> Wire:
+    """The wire of the rig as built, with a round pupil and an even field; ranges of kappa are not set.
+
+    Args:
+        geometry: gives the rays.
+        start: the rig as built.
+        harmonics: orders (n, m) along X and Y.
+        rules: for the degrees of the shading.
+    """
+    degrees = (rules or WireRules()).smooth_degrees[1] + 1
+    fields = np.zeros((len(harmonics), 2, 2, 4))
+    fields[:, 0, 0, 0] = 1.0
+    return Wire(
+        geometry=geometry,
+        rotation_rad=np.zeros(3),
+        standoff_per_pitch=np.float64(start.standoff_per_pitch),
+        offset_periods=np.zeros(2),
+        footprint_per_pitch=np.float64(start.footprint_per_pitch),
+        row_open=np.float64(start.row_open),
+        column_open=np.float64(start.column_open),
+        depth_per_pitch=np.float64(start.depth_per_pitch),
+        harmonics=harmonics,
+        frequency=np.tile([0.0, 1.0], (len(harmonics), 1)),
+        fields=fields,
+        amplitudes=np.zeros((0, 2, 1, 1)),
+        baseline=np.zeros((degrees, degrees)),
+    )
+
 
 _POSE = "rotation_x_deg", "rotation_y_deg", "rotation_z_deg", "standoff_per_pitch"
 _PUPIL = "offset_x_periods", "offset_y_periods", "footprint_per_pitch"
@@ -65,13 +209,6 @@ class Kind(enum.IntEnum):
     SHAPE = 4
 
 
-def element_name(kind: int, a: int, b: int, c: int, d: int) -> str:
-    """Name of a fitted element of the wire's arrays: the array, and its indices."""
-    if kind == Kind.SHADING:
-        return f"baseline.{c}.{d}"
-    return f"{'amplitudes' if kind == Kind.AMPLITUDE else 'fields'}.{a}.{b}.{c}.{d}"
-
-
 @final
 @dataclass(frozen=True)
 class Parameters:
@@ -110,17 +247,9 @@ class Parameters:
         """Whether there is a panel; without one there is no shape."""
         return self.linear < len(self.columns)
 
-    @property
-    def strengths(self) -> Int[np.ndarray, " harmonics"]:
-        """Column of each harmonic's strength in even light; -1 where there is none."""
-        found = np.full(len(self.nothing.harmonics), -1)
-        columns = np.flatnonzero(self.of(Kind.FIELD) & ~self.columns[:, 2:].any(axis=1))
-        found[self.columns[columns, 1]] = columns
-        return found
-
     def kept(self, keep: Bool[np.ndarray, " n"]) -> Parameters:
         """Only the columns marked."""
-        return Parameters(self.nothing, self.columns[keep], self.groups[keep])
+        return replace(self, columns=self.columns[keep], groups=self.groups[keep])
 
     def vector(self, wire: Wire, gains: Float[np.ndarray, " sites"]) -> Float[np.ndarray, " n"]:
         """``x`` of a wire and the gains of the CFA sites."""
@@ -143,9 +272,8 @@ class Parameters:
 
     def prior(self, start: WireStart, rules: WireRules) -> Prior:
         """Prior by the rig description, widened; the origin is that of ``nothing``, within a period."""
-        built = replace(
-            ideal_wire(self.nothing.geometry, start, np.zeros((0, 2))), offset_periods=self.nothing.offset_periods
-        )
+        ideal = ideal_wire(self.nothing.geometry, start, np.zeros((0, 2)))
+        built = replace(ideal, offset_periods=self.nothing.offset_periods)
         mean, shape = self.vector(self.nothing, np.ones(self.sites)), self.indices(Kind.SHAPE)[0]
         sigma = np.array([np.inf, np.inf, rules.amplitude_sigma, rules.field_sigma, np.nan])[self.columns[:, 0]]
         mean[self.linear :] = shape_vector(built)[shape]
@@ -164,14 +292,10 @@ def _leaves(wire: Wire, gains: Float[np.ndarray, " sites"]) -> dict[Kind, Float[
 def parameters_of(
     wire: Wire, rules: WireRules, sites: int, bounds: Iterable[float] = (), panel: bool = True
 ) -> Parameters:
-    """All columns, for shading, site gains, the wire's amplitudes, corrections to the round pupil, and the shape.
+    """All columns for ``wire``, whose arrays set their number, and for the ``sites`` of the CFA's cell.
 
-    Args:
-        wire: its arrays set the number of amplitudes and fields; numbers without a column keep their values.
-        rules: for the degrees.
-        sites: number of sites of the CFA's cell.
-        bounds: of the harmonics' relative amplitudes; stronger ones have more corrections.
-        panel: whether there is one; without it there is no shape.
+    The stronger harmonics are by the ``bounds`` of their amplitudes, the more corrections to a round pupil they have.
+    Without a ``panel`` there is no shape. Numbers without a column keep their values.
     """
     nothing = replace(wire, baseline=np.zeros_like(wire.baseline), amplitudes=np.zeros_like(wire.amplitudes))
     strongest, _, degrees, _ = np.shape(nothing.amplitudes)
@@ -195,55 +319,3 @@ def parameters_of(
 
 def _pairs(count: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(count) for j in range(count - i)]
-
-
-@final
-@dataclass(frozen=True)
-class Selected:
-    """Columns that are kept, and the solution with them alone."""
-
-    keep: Bool[np.ndarray, " all"]
-    values: Float[np.ndarray, " all"]
-
-
-def select(
-    matrix: Float[np.ndarray, "all all"],
-    right: Float[np.ndarray, " all"],
-    power: float,
-    samples: int,
-    groups: Int[np.ndarray, " all"],
-) -> Choice[Selected]:
-    """Drop groups of columns, the weakest first, while that lowers BIC.
-
-    A group of k columns is kept when leaving it out raises chi-squared, in units of the residual variance of the full
-    model (so that PRNU counts as noise), by more than k ln(samples). The result holds the full choice and the last
-    steps to the best one.
-
-    Args:
-        matrix, right: normal equations of all columns.
-        power: weighted sum of the squared data.
-        samples: number of data.
-        groups: group of each column; -1 is always kept.
-    """
-    unit = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    # The tiny ridge only decides between columns that the data cannot distinguish.
-    cov = np.linalg.inv(matrix / np.outer(unit, unit) + 1e-10 * np.eye(len(unit))) / np.outer(unit, unit)
-    values, keep, total = cov @ right, np.ones(len(right), dtype=bool), len(np.unique(groups[groups >= 0]))
-    variance = max((power - float(right @ values)) / max(samples - len(right), 1), 1e-300)
-    tried: list[Attempt[Selected]] = []
-    while True:
-        optional = np.unique(groups[keep & (groups >= 0)])
-        criterion = bic((power - float(right @ values)) / variance, float(keep.sum()), samples)
-        selected = Selected(keep, values)
-        tried.append(Attempt(f"{len(optional)} of {total} terms", int(keep.sum()), criterion, selected))
-        # The exact rise of chi-squared when one group is left out, by column.
-        inside = [np.flatnonzero(groups == group) for group in optional]
-        rises = [values[g] @ np.linalg.solve(cov[np.ix_(g, g)], values[g]) / len(g) / variance for g in inside]
-        if not rises or min(rises) >= np.log(samples):
-            return choose((tried[0], *tried[1:][-8:]))
-        weakest = inside[int(np.argmin(rises))]
-        gone = np.linalg.solve(cov[np.ix_(weakest, weakest)], cov[weakest])
-        # By Schur's complement, the inverse without these rows and columns.
-        values, cov = values - gone.T @ values[weakest], cov - cov[:, weakest] @ gone
-        values[weakest], cov[weakest], cov[:, weakest] = 0.0, 0.0, 0.0
-        keep = keep & (groups != groups[weakest[0]])

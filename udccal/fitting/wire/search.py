@@ -1,11 +1,12 @@
 """The search for the wire far around the rig description: descents from the places that a scan finds.
 
-The scan finds stand-off, pupil and origin by demodulation of the rows' and the columns' first harmonic.
+The scan finds stand-off, pupil and origin by demodulation of the rows' and the columns' first harmonic. The place of
+faint columns is sought beside: a part of a period on, they may fit nearly as well, and the descent may end there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -16,21 +17,42 @@ from scipy.special import j1
 
 from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.orders import bic
-from udccal.fitting.wire.columns import likely_columns
 from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, weighed
-from udccal.fitting.wire.jacobian import WireProblem, rays_at, values_at, weighed_at, with_harmonics
-from udccal.fitting.wire.parameters import parameters_of, shape_sigma, shape_vector, with_shape
-from udccal.fitting.wire.rules import SOLVER, Harmonics, WireRules, WireStart, ideal_wire, possible_harmonics
+from udccal.fitting.wire.jacobian import WireProblem, expected_of, rays_at, values_at, weighed_at, with_harmonics
+from udccal.fitting.wire.parameters import (
+    SHAPE_NAMES,
+    SOLVER,
+    Harmonics,
+    WireRules,
+    WireStart,
+    ideal_wire,
+    parameters_of,
+    possible_harmonics,
+    shape_sigma,
+    shape_vector,
+    with_shape,
+)
 from udccal.models.wire import Wire
+
+# Gains of the CFA sites.
+_Gains = Float[np.ndarray, " sites"]
+# Places of faint columns to try, in periods, and the distance within which minima are one.
+_SHIFTS, _APART = np.arange(8) / 8, 1 / 32
 
 
 @final
 @dataclass(frozen=True)
 class Descent:
-    """A fit to a sample, and where it ended."""
+    """A fit to a sample, and where it ended.
+
+    ``gain`` is the chi-squared that the rows explain in the pixels of the search, ``sharpness`` that of the openings'
+    edges.
+    """
 
     problem: WireProblem
     solution: Solution[Float[np.ndarray, " n"], Blocks]
+    gain: float = 0.0
+    sharpness: float = 1.0
 
     @property
     def wire(self) -> Wire:
@@ -38,7 +60,7 @@ class Descent:
         return self.problem.parameters.wire(self.solution.place)
 
     @property
-    def gains(self) -> Float[np.ndarray, " sites"]:
+    def gains(self) -> _Gains:
         """Gains of the CFA sites."""
         return self.problem.parameters.gains(self.solution.place)
 
@@ -59,20 +81,6 @@ class Descent:
 
 @final
 @dataclass(frozen=True)
-class Found:
-    """A fit whose shape is nearly final, the pixels searched, and the chi-squared that the rows explain in them.
-
-    ``sharpness`` is that of the openings' edges.
-    """
-
-    descent: Descent
-    searched: Pixels
-    gain: float
-    sharpness: float = 1.0
-
-
-@final
-@dataclass(frozen=True)
 class Search:
     """A search by a flat with the rig as built, its noise and the rules."""
 
@@ -85,14 +93,13 @@ class Search:
         """Those that are fitted."""
         return possible_harmonics(self.data.start, self.rules.least_amplitude)
 
-    def found(self, few: Pixels, many: Pixels) -> Found:
+    def found(self, few: Pixels, many: Pixels) -> Descent:
         """Fit the shading alone, then stand-off and origin by demodulation of the first harmonics, then all together.
 
         The search uses ``few`` pixels and the strongest harmonics; the last fit uses ``many`` pixels and all harmonics.
-        Rows that ``few`` do not show are searched in ``many``.
+        Rows that ``few`` do not show are searched in ``many``; without any, the shading's fit comes back.
         """
-        start, rules = self.data.start, self.rules
-        harmonics = self.harmonics.orders
+        start, rules, harmonics = self.data.start, self.rules, self.harmonics.orders
         strongest = harmonics[: rules.search_harmonics]
         for sample in (few, many):
             bare = self._shading(strongest, sample)
@@ -101,7 +108,7 @@ class Search:
             if gain >= rules.least_gain:
                 break
         else:
-            return Found(bare, sample, gain)
+            return Descent(replace(bare.problem, pixels=sample), bare.solution, gain)
         sharp = self._search(places, bare.gains, strongest, sample)
         weights, tried = sharp[0].weighs(many, self.noise), [(rules.sharpness[0], one) for one in sharp]
         for sharpness in rules.sharpness[1:]:
@@ -111,12 +118,12 @@ class Search:
             tried += [(sharpness, one) for one in soft if one.criterion < sharp[0].criterion]
         finished = []
         for sharpness, one in tried:
-            best, *_ = likely_columns(one.wire, one.gains, weights, start.column_open)
+            best, *_ = likely_columns(one, weights, start)
             wire = with_harmonics(best, harmonics, few, sharpness)
-            finished.append(Found(self._descent(wire, one.gains, weights), sample, gain, sharpness))
-        return min(finished, key=lambda one: one.descent.criterion)
+            finished.append(replace(self._descent(wire, one.gains, weights), gain=gain, sharpness=sharpness))
+        return min(finished, key=lambda one: one.criterion)
 
-    def resumed(self, wire: Wire, many: Pixels) -> Found:
+    def resumed(self, wire: Wire, many: Pixels) -> Descent:
         """The shape and the shading of an earlier fit as they are; its corrections of the pupil are chosen anew."""
         ideal = ideal_wire(self.data.geometry, self.data.start, wire.harmonics, self.rules)
         shaped = replace(with_shape(ideal, shape_vector(wire)), baseline=wire.baseline, amplitudes=wire.amplitudes)
@@ -128,8 +135,8 @@ class Search:
         for sharpness in self.rules.sharpness:
             one = with_harmonics(shaped, wire.harmonics, many, sharpness)
             descent = self._descent(one, gains, pixels, SolverRules(iterations=0), "wire, resumed")
-            found.append(Found(descent, pixels, float(without - with_rows) / descent.variance, sharpness))
-        return min(found, key=lambda one: one.descent.criterion)
+            found.append(replace(descent, gain=float(without - with_rows) / descent.variance, sharpness=sharpness))
+        return min(found, key=lambda one: one.criterion)
 
     def _shading(self, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels) -> Descent:
         """Fit the shading without any panel: no modulation, and no openings that narrow with obliquity."""
@@ -147,11 +154,7 @@ class Search:
         return descent
 
     def _search(
-        self,
-        places: list[Wire],
-        gains: Float[np.ndarray, " sites"],
-        harmonics: Float[np.ndarray, "harmonics 2"],
-        sample: Pixels,
+        self, places: list[Wire], gains: _Gains, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels
     ) -> list[Descent]:
         """Descend from the places of a scan: a few steps from each, and to the end from the best.
 
@@ -159,12 +162,15 @@ class Search:
         pixels cannot distinguish such rivals, all of them come back, best first.
         """
         depth, tried = np.float64(self.data.start.depth_per_pitch), []
-        for place in (places[0], *beside(places[0]), *places[1:]):
-            placed = replace(scan_columns(place, gains, sample), depth_per_pitch=depth)
+        for place in (places[0], *_beside(places[0]), *places[1:]):
+            # The rows have given the rest; the columns' first harmonic gives the origin along X.
+            standoff, pupil = place.standoff_per_pitch, place.footprint_per_pitch
+            _, angle = _demodulate(place, gains, sample, 0, np.array([standoff]), np.array([pupil]))
+            placed = replace(_placed(place, standoff, pupil, 0, angle[0, 0]), depth_per_pitch=depth)
             wire = with_harmonics(placed, harmonics, sample, self.rules.sharpness[0])
             tried.append(self._descent(wire, gains, sample, SolverRules(least_gain=1e-2, iterations=3)))
         unfinished = _rivals(tried, self.rules.unfinished)
-        rivals = _rivals([self._descent(one.wire, one.gains, sample) for one in unfinished], self.rules.rival)
+        rivals = _rivals((self._descent(one.wire, one.gains, sample) for one in unfinished), self.rules.rival)
         best, (count, degree) = rivals[0], self.rules.free
         if (variance := best.variance) <= self.rules.doubtful_variance:
             return rivals
@@ -176,7 +182,7 @@ class Search:
     def _descent(
         self,
         wire: Wire,
-        gains: Float[np.ndarray, " sites"],
+        gains: _Gains,
         pixels: Pixels,
         solver: SolverRules = SOLVER,
         name: str = "wire, shape",
@@ -188,14 +194,51 @@ class Search:
         return Descent(problem, minimise(problem, parameters.vector(wire, gains), solver))
 
 
-def _rivals(tried: Sequence[Descent], margin: float) -> list[Descent]:
+def _rivals(tried: Iterable[Descent], margin: float) -> list[Descent]:
     """The descents that the data so far cannot distinguish from the best one, best first."""
     ordered = sorted(tried, key=lambda one: one.solution.equations.cost)
     return [one for one in ordered if one.solution.equations.cost < ordered[0].solution.equations.cost + margin]
 
 
+def likely_columns(descent: Descent, pixels: Pixels, start: WireStart, margin: float = 0.0) -> list[Wire]:
+    """The wire with its origin along X moved by each eighth of a period, where that fits the pixels; the best is first.
+
+    Chi-squared is at most ``margin`` above the lowest. The columns' openings are as built: a fit to few pixels may put
+    faint columns half a period off, with openings wider than their period.
+    """
+    wire = replace(descent.wire, column_open=np.float64(start.column_open))
+    shifted = [replace(wire, offset_periods=wire.offset_periods + np.array([shift, 0.0])) for shift in _SHIFTS]
+    errors = (pixels.value - expected_of(one, descent.gains, pixels) for one in shifted)
+    chi2 = np.array([np.sum(error**2 * pixels.weight) for error in errors])
+    return [shifted[k] for k in np.argsort(chi2, kind="stable") if chi2[k] <= chi2.min() + margin]
+
+
+def best_of_columns(here: Descent, starts: list[Wire]) -> tuple[Descent, Float[np.ndarray, "n n"]]:
+    """The lowest of the minima that are reached from the columns' places of other wires, and the parameters' spread.
+
+    The spread is the second moment of all minima about the lowest one, each with the weight of its likelihood.
+    """
+    problem, first = here.problem, here.problem.parameters.linear
+    offset, opening = (first + SHAPE_NAMES.index(name) for name in ("offset_x_periods", "column_open"))
+    tried = [here.solution]
+    for start in starts:
+        x = here.solution.place.copy()
+        x[offset], x[opening] = float(start.offset_periods[0]), float(start.column_open)
+        tried.append(minimise(problem, x, SOLVER))
+    best, *others = sorted(tried, key=lambda one: one.equations.cost)
+    away, weights = [np.zeros_like(best.place)], [1.0]
+    for one in others:
+        moved = one.place - best.place
+        moved[offset] -= np.round(moved[offset])
+        if min(abs(moved[offset] - other[offset]) for other in away) > _APART:
+            away.append(moved)
+            weights.append(float(np.exp(0.5 * (best.equations.cost - one.equations.cost))))
+    part, off = np.array(weights) / np.sum(weights), np.array(away)
+    return replace(here, solution=best), np.asarray((off.T * part) @ off)
+
+
 def scan_rows(
-    wire: Wire, gains: Float[np.ndarray, " sites"], start: WireStart, pixels: Pixels, rules: WireRules
+    wire: Wire, gains: _Gains, start: WireStart, pixels: Pixels, rules: WireRules
 ) -> tuple[list[Wire], float]:
     """Wires whose stand-off, pupil and origin along Y put most signal into the rows' first harmonic, best first.
 
@@ -219,21 +262,13 @@ def scan_rows(
     return found, float(gain[tuple(peaks[order[0]])]) if found else 0.0
 
 
-def beside(place: Wire) -> list[Wire]:
+def _beside(place: Wire) -> list[Wire]:
     """The places with a pupil one period larger or smaller, where the first harmonic's sign and the origin change.
 
     For a pupil of several periods, a period of diameter is one zero more, or less, in the pupil's transform.
     """
-    pupil, standoff = float(place.footprint_per_pitch), float(place.standoff_per_pitch)
-    angle = 2 * np.pi * (float(np.asarray(place.offset_periods)[1]) + 0.5)
-    return [_placed(place, standoff, size, 1, angle) for size in (pupil - 1.0, pupil + 1.0) if size > 1.0]
-
-
-def scan_columns(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Wire:
-    """The wire with the origin along X from the columns' first harmonic; the rows have given the rest."""
-    standoff, pupil = float(wire.standoff_per_pitch), float(wire.footprint_per_pitch)
-    _gain, angle = _demodulate(wire, gains, pixels, 0, np.array([standoff]), np.array([pupil]))
-    return _placed(wire, standoff, pupil, 0, angle[0, 0])
+    pupil, angle = float(place.footprint_per_pitch), 2 * np.pi * (float(place.offset_periods[1]) + 0.5)
+    return [_placed(place, place.standoff_per_pitch, size, 1, angle) for size in (pupil - 1, pupil + 1) if size > 1]
 
 
 def _trials(ends: tuple[float, float], step: float, most: int) -> Float[np.ndarray, " n"]:
@@ -246,7 +281,7 @@ def _trials(ends: tuple[float, float], step: float, most: int) -> Float[np.ndarr
 
 def _demodulate(
     wire: Wire,
-    gains: Float[np.ndarray, " sites"],
+    gains: _Gains,
     pixels: Pixels,
     axis: int,
     standoffs: Float[np.ndarray, " s"],
@@ -259,7 +294,7 @@ def _demodulate(
     errors = (pixels.value / level - whole) * root
     variance = max(float(np.sum(errors**2)) / max(pixels.used, 1), 1e-300)
     rays = rays_at(wire, pixels)
-    slope = (rays.periods[axis] - np.asarray(wire.offset_periods)[axis]) / float(wire.standoff_per_pitch)
+    slope = (rays.periods[axis] - wire.offset_periods[axis]) / float(wire.standoff_per_pitch)
     z = np.pi * pupils[:, None] * np.sqrt(rays.ellipse[2 * axis])
     sizes = root * 2.0 * np.sinc(rays.openings[axis]) * 2.0 * j1(z) / z
     power = np.maximum(np.sum(sizes**2, axis=1), 1e-300)
@@ -272,6 +307,5 @@ def _demodulate(
 def _placed(wire: Wire, standoff: float, pupil: float, axis: int, angle: float) -> Wire:
     offset = np.array(wire.offset_periods, dtype=np.float64)
     offset[axis] = float(angle) / (2 * np.pi)
-    return replace(
-        wire, standoff_per_pitch=np.float64(standoff), footprint_per_pitch=np.float64(pupil), offset_periods=offset
-    )
+    lengths = {"standoff_per_pitch": np.float64(standoff), "footprint_per_pitch": np.float64(pupil)}
+    return replace(wire, offset_periods=offset, **lengths)
