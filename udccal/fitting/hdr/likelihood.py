@@ -31,9 +31,8 @@ from udccal.errors import FitError
 from udccal.models.arrays import Arrayish
 from udccal.models.noise import Noise, linear_signal
 
-# Numbers by sample and by pixel.
-Samples = Float[Arrayish, "n pixels"]
-Picture = Float[Arrayish, " pixels"]
+PerSample = Float[Arrayish, "n pixels"]
+PerPixel = Float[Arrayish, " pixels"]
 _PEAK = 0.3989422804  # of the normal density
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
 _LEAST_VARIANCE = 0.25
@@ -60,7 +59,7 @@ class HdrRules:
 
     # A sample farther than this from the other samples of its pixel is a hit, clipped or not.
     believed_sigma: float = 6.0
-    # Samples count as clipped from this many sigma of dark noise below saturation on.
+    # PerSample count as clipped from this many sigma of dark noise below saturation on.
     margin_sigma: float = 6.0
     # A frame is left out when its light is off by more than both (relative, and in sigma).
     frame_off: float = 0.02
@@ -114,23 +113,23 @@ class SensorNumbers(eqx.Module):
         level = linear_signal(saturation - black, bend) / K - rules.margin_sigma * floor**0.5
         return cls(black, 1 / K, dark * unit_s, floor, level, offset, rounding, below, bend)
 
-    def electrons(self, codes: Samples) -> Samples:
+    def electrons(self, codes: PerSample) -> PerSample:
         """Light of samples in e-, dark current included; the response's bend is taken out."""
-        signal: Samples = linear_signal(codes - self.black_DN, self.bend_per_DN)
+        signal: PerSample = linear_signal(codes - self.black_DN, self.bend_per_DN)
         return signal * self.e_per_DN
 
 
 class BlockMerge(eqx.Module):
     """Rate and sigma in e-/s, number of unclipped samples, worst sample, and the square of its deviation in sigma."""
 
-    rate: Picture
-    sigma: Picture
+    rate: PerPixel
+    sigma: PerPixel
     used: Int[Arrayish, " pixels"]
     worst: Int[Arrayish, " pixels"]
-    deviation2: Picture
+    deviation2: PerPixel
 
 
-def _mills(z: Samples, xp: ModuleType) -> Samples:
+def _mills(z: PerSample, xp: ModuleType) -> PerSample:
     """Density over upper tail of the normal distribution to 1e-3: Abramowitz and Stegun 7.1.26, from 5 on 26.2.12."""
     far = xp.maximum(z, 5.0)
     t = 1 / (1 + 0.23164189 * abs(z))
@@ -140,7 +139,7 @@ def _mills(z: Samples, xp: ModuleType) -> Samples:
     return xp.where(z > 5, far + (1 - 2 / far**2) / far, near)
 
 
-def _bias_by_information(z: Samples, ratio: Samples, scale: Samples, xp: ModuleType) -> Picture:
+def _bias_by_information(z: PerSample, ratio: PerSample, scale: PerSample, xp: ModuleType) -> PerPixel:
     """Bias of the likeliest rate times its information; samples are censored at ``z`` sigma, ``scale`` is t / sigma.
 
     With U the score, it is -(E[U^3] + E[U U']) / 2 over the expected information, each a sum over the pixel's samples.
@@ -151,7 +150,7 @@ def _bias_by_information(z: Samples, ratio: Samples, scale: Samples, xp: ModuleT
     return 0.5 * (scale**3 * density * (1 + z * (z - ratio))).sum(axis=0) / xp.maximum(information, _TINY)
 
 
-def _upward_deviance(beyond: Samples, mean: Samples, variance: Samples, xp: ModuleType) -> Samples:
+def _upward_deviance(beyond: PerSample, mean: PerSample, variance: PerSample, xp: ModuleType) -> PerSample:
     """Deviance of scaled counts of this variance and skewness: few electrons scatter more upwards than downwards."""
     scale = xp.maximum(mean / variance, 0.03)
     relative = xp.maximum(beyond * scale / variance, 0)
@@ -169,7 +168,7 @@ def merge_block(
     """Maximum-likelihood rates, computed by the functions of ``xp``, numpy or jax.numpy."""
     time = times[:, None]
 
-    def expected(rate: Picture) -> tuple[Samples, Samples]:
+    def expected(rate: PerPixel) -> tuple[PerSample, PerSample]:
         mean = (rate + sensor.dark_e_per_s) * time
         return mean, xp.maximum(mean + sensor.floor_e2, _LEAST_VARIANCE * sensor.floor_e2)
 
@@ -218,3 +217,53 @@ def merge_block(
 
 
 compiled_merge_block = jax.jit(merge_block, static_argnames=("believed_sigma", "xp"))
+
+
+_Some = Float[np.ndarray, "n some"]
+_Used = Bool[np.ndarray, "n some"]
+
+
+@final
+@dataclass(frozen=True)
+class Residuals:
+    """Samples of some pixels in electrons: light less its mean, signal above dark and variance, by the merged light.
+
+    ``weight`` is what each tells of its pixel's light, 0 for clipped ones; ``clear`` ones are clear of clipping.
+    """
+
+    times: Float[np.ndarray, "n 1"]
+    errors: _Some
+    mean: _Some
+    signal: _Some
+    variance: _Some
+    weight: _Some
+    clear: _Used
+
+    def bright(self, sigmas: float) -> _Used:
+        """The clear ones whose signal is more than so many of their sigmas."""
+        return self.clear & (sigmas * np.sqrt(self.variance) < self.signal)
+
+    def left(self, cause: Float[np.ndarray, "*k n some"], weight: _Some) -> Float[np.ndarray, "*k n some"]:
+        """What of a deviation is left in the errors where each pixel's light, with these weights, follows it."""
+        information = np.maximum((weight * self.times**2).sum(axis=0), 1e-30)
+        followed = (weight * self.times * cause).sum(axis=-2, keepdims=True) / information
+        left = cause - self.times * followed
+        # Where the light follows it altogether, rounding leaves something.
+        return np.where(np.abs(left) > 1e-9 * np.abs(cause), left, 0.0)
+
+    def amounts(
+        self, causes: Float[np.ndarray, "k n some"], weight: _Some, used: _Used, most_sigma: float
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """How much of some deviations the errors have together, by what is left of them; hits count as limits.
+
+        The sigma of what these samples do not show is infinite.
+        """
+        sigma = np.sqrt(self.variance[used])
+        errors = np.clip(self.errors[used] / sigma, -most_sigma, most_sigma)
+        left = self.left(causes, weight)[:, used] / sigma
+        size = np.maximum(np.linalg.norm(left, axis=1), 1e-30)
+        left = left / size[:, None]
+        # All frames together have the light of the pixels, which is not known otherwise.
+        cov = np.linalg.pinv(left @ left.T, rcond=1e-9, hermitian=True)
+        own = np.diag(cov)
+        return cov @ (left @ errors) / size, np.where(own > 0, np.sqrt(np.maximum(own, 0.0)) / size, np.inf)

@@ -16,7 +16,14 @@ from jaxtyping import Bool, Float, Int, UInt16
 from udccal.arguments import found_instead
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.hdr.likelihood import BlockMerge, HdrRules, SensorNumbers, compiled_merge_block, merge_block
+from udccal.fitting.hdr.likelihood import (
+    BlockMerge,
+    HdrRules,
+    Residuals,
+    SensorNumbers,
+    compiled_merge_block,
+    merge_block,
+)
 from udccal.models.noise import Noise
 from udccal.result import FitStatus, Outliers
 
@@ -129,55 +136,6 @@ def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposur
     return times
 
 
-_Some = Float[np.ndarray, "n some"]
-_Used = Bool[np.ndarray, "n some"]
-
-
-@final
-@dataclass(frozen=True)
-class _Samples:
-    """Samples of some pixels in electrons: light less its mean, signal above dark and variance, by the merged light.
-
-    ``weight`` is what each tells of its pixel's light, 0 for clipped ones; ``clear`` ones are clear of clipping.
-    """
-
-    times: Float[np.ndarray, "n 1"]
-    errors: _Some
-    mean: _Some
-    signal: _Some
-    variance: _Some
-    weight: _Some
-    clear: _Used
-
-    def bright(self, sigmas: float) -> _Used:
-        """The clear ones whose signal is more than so many of their sigmas."""
-        return self.clear & (sigmas * np.sqrt(self.variance) < self.signal)
-
-    def left(self, cause: Float[np.ndarray, "*k n some"], weight: _Some) -> Float[np.ndarray, "*k n some"]:
-        """What of a deviation is left in the errors where each pixel's light, with these weights, follows it."""
-        information = np.maximum((weight * self.times**2).sum(axis=0), 1e-30)
-        followed = (weight * self.times * cause).sum(axis=-2, keepdims=True) / information
-        left = cause - self.times * followed
-        # Where the light follows it altogether, rounding leaves something.
-        return np.where(np.abs(left) > 1e-9 * np.abs(cause), left, 0.0)
-
-    def amounts(
-        self, left: Float[np.ndarray, "k n some"], used: _Used, most_sigma: float
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """How much of some deviations the errors have together, by what is ``left`` of them; hits count as limits.
-
-        The sigma of what these samples do not show is infinite.
-        """
-        sigma = np.sqrt(self.variance[used])
-        errors, left = np.clip(self.errors[used] / sigma, -most_sigma, most_sigma), left[:, used] / sigma
-        size = np.maximum(np.linalg.norm(left, axis=1), 1e-30)
-        left = left / size[:, None]
-        # All frames together have the light of the pixels, which is not known otherwise.
-        cov = np.linalg.pinv(left @ left.T, rcond=1e-9, hermitian=True)
-        own = np.diag(cov)
-        return cov @ (left @ errors) / size, np.where(own > 0, np.sqrt(np.maximum(own, 0.0)) / size, np.inf)
-
-
 @final
 @dataclass(frozen=True)
 class _Bracket:
@@ -226,7 +184,7 @@ class _Bracket:
             left[i] = rest._frame_scores(rest.merged(), least - 1, 10.0).max()
         return np.argsort(left)[: max(1, int(np.sum(left <= most)))]
 
-    def _samples(self, merged: BlockMerge, least: int, least_rate: float = 0.0, most: int = _JUDGED) -> _Samples:
+    def _samples(self, merged: BlockMerge, least: int, least_rate: float = 0.0, most: int = _JUDGED) -> Residuals:
         """Of some pixels, about ``most``, with more than ``least_rate`` and at least so many samples."""
         sensor, pixels = self.sensor, np.flatnonzero((merged.used >= least) & (merged.rate > least_rate))
         pixels = pixels[:: max(1, len(pixels) // max(min(most, _JUDGED), 1))]
@@ -237,7 +195,7 @@ class _Bracket:
         variance = np.maximum(mean, 0.0) + sensor.floor_e2
         weight = np.where(~self.dropped & (light < sensor.level_e), 1 / variance, 0.0)
         clear = ~self.dropped & (mean + 5 * np.sqrt(variance) < sensor.level_e)
-        return _Samples(times, light - mean, mean, signal, variance, weight, clear)
+        return Residuals(times, light - mean, mean, signal, variance, weight, clear)
 
     def _frames_light(
         self, merged: BlockMerge, least: int, bright: float
@@ -250,7 +208,7 @@ class _Bracket:
         used = seen.bright(bright)
         for i in np.flatnonzero(used.sum(axis=1) >= 8):
             frame = np.eye(len(off))[i, None, :, None] * seen.signal
-            (off[i],), (sigma[i],) = seen.amounts(seen.left(frame, seen.weight), used, self.rules.believed_sigma)
+            (off[i],), (sigma[i],) = seen.amounts(frame, seen.weight, used, self.rules.believed_sigma)
         return off, sigma
 
     def _frame_scores(self, merged: BlockMerge, least: int, bright: float) -> Float[np.ndarray, " n"]:
@@ -263,8 +221,8 @@ class _Bracket:
         count = len(self.times)
         seen = self._samples(merged, 2, most=2_000_000 // count**2)
         bent = -(seen.signal**2) / float(self.sensor.level_e)
-        left = seen.left(np.concatenate([np.eye(count)[:, :, None] * seen.signal, bent[None]]), seen.weight)
-        off, sigma = seen.amounts(left, seen.bright(3.0), self.rules.believed_sigma)
+        causes = np.concatenate([np.eye(count)[:, :, None] * seen.signal, bent[None]])
+        off, sigma = seen.amounts(causes, seen.weight, seen.bright(3.0), self.rules.believed_sigma)
         # The light of few electrons hardly tells it, and is itself too uncertain.
         known = 2 * sigma[-1] < self.rules.bend_off
         most = max(self.rules.bend_off, self.rules.frame_sigma * sigma[-1])
@@ -352,8 +310,8 @@ class _Bracket:
         seen, floor = self._samples(merged, 2, -np.inf), float(self.sensor.floor_e2)
         dark = seen.clear & (seen.mean < 30 * floor)
         # Light whose brighter samples are off themselves must not count.
-        left = seen.left(np.ones_like(seen.mean), dark / seen.variance)
-        (found,), (sigma,) = seen.amounts(left[None], dark, self.rules.believed_sigma)
+        offset = np.ones((1, *seen.mean.shape))
+        (found,), (sigma,) = seen.amounts(offset, dark / seen.variance, dark, self.rules.believed_sigma)
         least = max(self.rules.black_off * floor**0.5, 6 * sigma, self.sensor.rounding_e)
         return float(found) if abs(found) > least else 0.0
 

@@ -65,12 +65,9 @@ class WireData:
     cfa: str = "RGGB"
 
     def __post_init__(self) -> None:
-        for name, array in (("signal", self.signal), ("variance", self.variance)):
-            advice = "Pass the average of one mosaic."
-            check_array(array, f"the {name}", "real numbers", ("rows", "columns"), advice, FitError)
-        if self.signal.shape != self.variance.shape:
-            found = f"{self.signal.shape} and {self.variance.shape}"
-            raise FitError(f"Expected signal and variance of one shape, found {found}. Give each pixel its variance.")
+        advice = "Pass the average of one mosaic, and give each pixel its variance."
+        check_array(self.signal, "the signal", "real numbers", ("rows", "columns"), advice, FitError)
+        check_array(self.variance, "the variance", "real numbers", self.signal.shape, advice, FitError)
         if self.variance.size and not (np.isfinite(self.variance) & (self.variance >= 0)).any():
             raise FitError("Expected variances of 0 or more, found none. Take them from the frames that were averaged.")
         for name, number in (("PRNU1288", self.PRNU1288), ("part of clipped pixels", self.clipped)):

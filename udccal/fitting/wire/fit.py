@@ -32,7 +32,6 @@ from udccal.fitting.wire.map_error import (
     mean_one,
     misfits,
     omitted,
-    rms,
     strengths_of,
     tied_sigma,
     unseen,
@@ -251,14 +250,14 @@ def _result(
     over the sensor.
     """
     seen, solution, model = joint.seen, joint.last.solution, float(np.hypot(found.sigma, left_out))
-    posterior, map_sigma = _posterior(joint, jacobian, model), jacobian.sigma_map(joint.cov, model)
+    posterior = _posterior(joint, jacobian, model)
     term, outliers = _trimmed(posterior.term), seen.outliers(shape[1])
     drawn = np.flatnonzero(seen.pixels.weight > 0)
     mounted = Rotation.from_rotvec(term.geometry.rotation_rad)
     turned = Rotation.from_rotvec(term.rotation_rad) * mounted
     tilt, nominal = (np.rad2deg(np.arcsin(np.clip(one.as_matrix()[1, 2], -1.0, 1.0))) for one in (turned, mounted))
     diagnostics = (
-        ("wire_map_rms_sigma", 100 * rms(map_sigma), "%"),
+        ("wire_map_rms_sigma", 100 * jacobian.sigma(joint.cov, model), "%"),
         ("wire_map_model_sigma", 100 * model, "%"),
         ("harmonics_left_out", 100 * left_out, "%"),
         ("residual_pattern_p_value", found.pattern.test.p_value, "1"),
@@ -278,7 +277,7 @@ def _result(
         status = FitStatus.ABSENT
     else:
         status = FitStatus.CONVERGED if solution.converged else FitStatus.NOT_CONVERGED
-    named, cov = _estimates(joint, jacobian.cov_of_mean_one(joint.cov)) if joint.parameters.panel else ((), np.eye(0))
+    named, cov = _estimates(joint, jacobian) if joint.parameters.panel else ((), np.eye(0))
     return FitResult(
         name="wire",
         term=term,
@@ -293,7 +292,7 @@ def _result(
         outliers=outliers,
         residuals=residual_sample((seen.pixels.scaled[drawn] + 1) / 2 * [shape[1] - 1, shape[0] - 1], seen.z[drawn]),
         posterior=posterior,
-        map_sigma=map_sigma,
+        map_sigma=jacobian.sigma_map(joint.cov, model),
     )
 
 
@@ -347,22 +346,23 @@ def _notes(joint: _Joint, found: Misfits, left_out: float, rules: WireRules) -> 
         yield "Capture more flats, or give the fit more pixels."
 
 
-def _estimates(joint: _Joint, cov: Float[np.ndarray, "a a"]) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
+def _estimates(joint: _Joint, jacobian: MapJacobian) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
     """The shape, then all elements of the wire's arrays that were fitted, with their covariance."""
     parameters, prior = joint.parameters, joint.last.problem.prior
     # Gains of the CFA sites are not in the term: their errors remain in the variances of the others.
     others = np.flatnonzero(~parameters.of(Kind.SITE) & ~parameters.of(Kind.SHAPE))
     order = np.concatenate([np.flatnonzero(parameters.of(Kind.SHAPE)), others])
-    places = (
-        (_ARRAYS[Kind(kind)], index[2:] if kind == Kind.SHADING else index)
-        for kind, *index in parameters.columns[others].tolist()
-    )
-    names = (*SHAPE_NAMES, *(".".join(map(str, (array, *index))) for array, index in places))
+    names = list(SHAPE_NAMES)
+    for kind, *index in parameters.columns[others].tolist():
+        names.append(".".join(map(str, (_ARRAYS[kind], *(index[2:] if kind == Kind.SHADING else index)))))
     (values, unit), (known, wide) = _in_units(joint.x[order]), _in_units(prior.mean[order])
     sigma = prior.sigma[order] * wide
     # Places have no origin beforehand.
     values[4:6], sigma[4:6] = values[4:6] % 1.0, np.inf
-    cov = cov[np.ix_(order, order)] * np.outer(unit, unit)
+    # The first coefficient of the shading keeps the map's mean at 1.
+    change = np.eye(len(joint.x))
+    change[0] -= jacobian.of_mean
+    cov = (change @ joint.cov @ change.T)[np.ix_(order, order)] * np.outer(unit, unit)
     return estimates("wire", names, values, cov, priors_of(names, known, sigma)), cov
 
 

@@ -67,13 +67,7 @@ class MapJacobian:
 
     def sigma(self, cov: _Cov, model: float = 0.0) -> float:
         """Relative sigma of the map, RMS over the sensor; ``model`` is the relative model error."""
-        return rms(self.sigma_map(cov, model))
-
-    def cov_of_mean_one(self, cov: _Cov) -> _Cov:
-        """Covariance of the parameters where the first coefficient of the shading keeps the map's mean at 1."""
-        change = np.eye(len(cov))
-        change[0] -= self.of_mean
-        return np.asarray(change @ cov @ change.T)
+        return float(np.sqrt(np.mean(np.square(self.sigma_map(cov, model), dtype=np.float64))))
 
 
 def map_jacobian(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> MapJacobian:
@@ -86,11 +80,6 @@ def map_jacobian(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tupl
     rows[parameters.of(Kind.SITE)] = 0.0
     of_mean = rows.mean(axis=1)
     return MapJacobian(value, rows - of_mean[:, None] * value, of_mean)
-
-
-def rms(values: Float[np.ndarray, "..."]) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
 
 
 @final
@@ -294,9 +283,8 @@ def omitted(start: WireStart, wire: Wire, seen: Weighed, rules: WireRules) -> Om
     weight = pixels.weight * np.where(expected > 0, expected, 0.0)
     information = max(float(np.sum(weight * expected * template**2)), 1e-300)
     part = float(np.sum(weight * (pixels.value - expected) * template)) / information
-    return Omitted(
-        float(np.std(harmonics_alone(wire, left_out.orders, pixels.thinned(BLOCK)))), part, information**-0.5
-    )
+    every = harmonics_alone(wire, left_out.orders, pixels.thinned(BLOCK))
+    return Omitted(float(np.std(every)), part, information**-0.5)
 
 
 def harmonics_alone(wire: Wire, orders: Float[np.ndarray, "any 2"], pixels: Pixels) -> Float[np.ndarray, " n"]:

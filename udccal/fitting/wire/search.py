@@ -161,8 +161,13 @@ class Search:
         A pupil one period larger, with the origin half a period on, has nearly the same first harmonic. Where few
         pixels cannot distinguish such rivals, all of them come back, best first.
         """
-        depth, tried = np.float64(self.data.start.depth_per_pitch), []
-        for place in (places[0], *_beside(places[0]), *places[1:]):
+        depth, tried, first = np.float64(self.data.start.depth_per_pitch), [], places[0]
+        # For a pupil of several periods, a period of diameter is one zero more, or less, in its transform: the first
+        # harmonic's sign and the origin change.
+        turned = 2 * np.pi * (float(first.offset_periods[1]) + 0.5)
+        sizes = [size for size in (first.footprint_per_pitch - 1, first.footprint_per_pitch + 1) if size > 1]
+        beside = (_placed(first, first.standoff_per_pitch, size, 1, turned) for size in sizes)
+        for place in (first, *beside, *places[1:]):
             # The rows have given the rest; the columns' first harmonic gives the origin along X.
             standoff, pupil = place.standoff_per_pitch, place.footprint_per_pitch
             _, angle = _demodulate(place, gains, sample, 0, np.array([standoff]), np.array([pupil]))
@@ -260,15 +265,6 @@ def scan_rows(
     order = np.argsort([-score[i, j] for i, j in peaks], kind="stable")[: rules.places]
     found = [_placed(wire, standoffs[i], pupils[j], 1, angle[i, j]) for i, j in peaks[order]]
     return found, float(gain[tuple(peaks[order[0]])]) if found else 0.0
-
-
-def _beside(place: Wire) -> list[Wire]:
-    """The places with a pupil one period larger or smaller, where the first harmonic's sign and the origin change.
-
-    For a pupil of several periods, a period of diameter is one zero more, or less, in the pupil's transform.
-    """
-    pupil, angle = float(place.footprint_per_pitch), 2 * np.pi * (float(place.offset_periods[1]) + 0.5)
-    return [_placed(place, place.standoff_per_pitch, size, 1, angle) for size in (pupil - 1, pupil + 1) if size > 1]
 
 
 def _trials(ends: tuple[float, float], step: float, most: int) -> Float[np.ndarray, " n"]:
