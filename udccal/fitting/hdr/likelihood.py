@@ -17,12 +17,14 @@ not the weights.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Final, final
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
@@ -59,7 +61,7 @@ class HdrRules:
 
     # A sample farther than this from the other samples of its pixel is a hit, clipped or not.
     believed_sigma: float = 6.0
-    # PerSample count as clipped from this many sigma of dark noise below saturation on.
+    # Samples count as clipped from this many sigma of dark noise below saturation on.
     margin_sigma: float = 6.0
     # A frame is left out when its light is off by more than both (relative, and in sigma).
     frame_off: float = 0.02
@@ -216,7 +218,7 @@ def merge_block(
     return BlockMerge(rate - bias, xp.sqrt(1 / stated + offset**2), used, worst, deviation2)
 
 
-compiled_merge_block = jax.jit(merge_block, static_argnames=("believed_sigma", "xp"))
+compiled_merge_block = jax.jit(functools.partial(merge_block, xp=jnp), static_argnames="believed_sigma")
 
 
 _Some = Float[np.ndarray, "n some"]
@@ -265,5 +267,5 @@ class Residuals:
         left = left / size[:, None]
         # All frames together have the light of the pixels, which is not known otherwise.
         cov = np.linalg.pinv(left @ left.T, rcond=1e-9, hermitian=True)
-        own = np.diag(cov)
-        return cov @ (left @ errors) / size, np.where(own > 0, np.sqrt(np.maximum(own, 0.0)) / size, np.inf)
+        known = np.maximum(np.diag(cov), 0.0)
+        return cov @ (left @ errors) / size, np.where(known > 0, np.sqrt(known) / size, np.inf)

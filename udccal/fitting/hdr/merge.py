@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import final
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
@@ -157,19 +156,18 @@ class _Bracket:
 
     def merged(self) -> BlockMerge:
         """The light of all pixels."""
-        codes, pixels, dropped = self.codes, self.codes.shape[1], np.broadcast_to(self.dropped, self.codes.shape)
+        pixels, dropped = self.codes.shape[1], np.broadcast_to(self.dropped, self.codes.shape)
+
+        def of(part: slice, merge: Callable[..., BlockMerge] = merge_block) -> BlockMerge:
+            return merge(self.codes[:, part], self.times, self.sensor, dropped[:, part], self.rules.believed_sigma)
+
         if pixels < _LEAST_COMPILED:
-            return merge_block(codes, self.times, self.sensor, dropped, self.rules.believed_sigma)
+            return of(np.s_[:])
         out = BlockMerge(*(np.empty(pixels, kind) for kind in ("f4", "f4", "i4", "i4", "f4")))
-
-        def run(start: int) -> None:
-            part = np.s_[start : start + _BLOCK]
-            numbers = codes[:, part], self.times, self.sensor, dropped[:, part], self.rules.believed_sigma
-            _put(out, part, compiled_merge_block(*numbers, jnp))
-
+        # The last block overlaps the one before it, so that all have one size.
+        parts = [np.s_[one : one + _BLOCK] for one in (*range(0, pixels - _BLOCK, _BLOCK), pixels - _BLOCK)]
         with ThreadPoolExecutor(2) as pool:
-            # The last block overlaps the one before it, so that all have one size.
-            list(pool.map(run, (min(start, pixels - _BLOCK) for start in range(0, pixels, _BLOCK))))
+            list(pool.map(lambda part: _put(out, part, of(part, compiled_merge_block)), parts))
         return out
 
     def frames_off(self, merged: BlockMerge) -> Int[np.ndarray, " off"]:

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from udccal.arguments import check_kind
 from udccal.errors import FitError
-from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
@@ -42,6 +41,8 @@ from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 
+# A number of each column that may be fitted.
+_Columns = Float[np.ndarray, " all"]
 _ARRAYS = {Kind.SHADING: "baseline", Kind.AMPLITUDE: "amplitudes", Kind.FIELD: "fields"}
 
 
@@ -123,15 +124,11 @@ class Selected:
     """Columns that are kept, and the solution with them alone."""
 
     keep: Bool[np.ndarray, " all"]
-    values: Float[np.ndarray, " all"]
+    values: _Columns
 
 
 def select(
-    matrix: Float[np.ndarray, "all all"],
-    right: Float[np.ndarray, " all"],
-    power: float,
-    samples: int,
-    groups: Int[np.ndarray, " all"],
+    matrix: Float[np.ndarray, "all all"], right: _Columns, power: float, samples: int, groups: Int[np.ndarray, " all"]
 ) -> Choice[Selected]:
     """Drop groups of columns, the weakest first, while that lowers BIC.
 
@@ -218,29 +215,6 @@ def _joint(found: Descent, every: Pixels, search: Search) -> _Joint:
     return _Joint(found, last, x, cov, problem.variance(float(seen.z @ seen.z)), seen, orders, strengths)
 
 
-def _posterior(joint: _Joint, jacobian: MapJacobian, model: float) -> Posterior[Wire]:
-    """Posterior of the fitted parameters and of the model error.
-
-    The model error is a further modulation of unknown phase. Its cosine and sine are two more parameters, so that it
-    adds the same variance everywhere. To first order, the map's mean stays 1.
-    """
-
-    def term_at(values: Float[np.ndarray, " n_2"]) -> Wire:
-        x, beside = values[:-2].copy(), values[-2:]
-        x[0] -= jacobian.of_mean @ (x - joint.x)
-        wire = joint.parameters.wire(x)
-        amplitudes = np.zeros(max(np.shape(wire.amplitudes), (1, 2, 1, 1)))
-        amplitudes[: len(wire.amplitudes)] = wire.amplitudes
-        amplitudes[0, :, 0, 0] += beside
-        return replace(wire, amplitudes=amplitudes)
-
-    size = len(joint.x)
-    factor = np.zeros((size + 2, size + 2))
-    factor[:size, :size] = square_root(joint.cov)
-    factor[size:, size:] = model * np.eye(2)
-    return Posterior(np.append(joint.x, [0.0, 0.0]), factor, term_at)
-
-
 def _result(
     joint: _Joint, jacobian: MapJacobian, found: Misfits, left_out: float, shape: tuple[int, int], rules: WireRules
 ) -> FitResult[Wire]:
@@ -250,7 +224,7 @@ def _result(
     over the sensor.
     """
     seen, solution, model = joint.seen, joint.last.solution, float(np.hypot(found.sigma, left_out))
-    posterior = _posterior(joint, jacobian, model)
+    posterior = jacobian.posterior(joint.parameters, joint.x, joint.cov, model)
     term, outliers = _trimmed(posterior.term), seen.outliers(shape[1])
     drawn = np.flatnonzero(seen.pixels.weight > 0)
     mounted = Rotation.from_rotvec(term.geometry.rotation_rad)

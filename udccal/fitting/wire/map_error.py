@@ -10,7 +10,9 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
+from scipy.linalg import block_diag
 
+from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import MisfitTest, chi2_test, excess_sigma, excess_variance, sharper
 from udccal.fitting.engine.report import coarse
 from udccal.fitting.wire.data import BLOCK, Pixels, Weighed, pixels_at
@@ -29,6 +31,7 @@ from udccal.models.wire import Wire
 
 # Places of the map's Jacobian, down and across.
 _PLACES = 64
+_Vector = Float[np.ndarray, " n"]
 _Cov = Float[np.ndarray, "n n"]
 
 
@@ -38,7 +41,7 @@ def _grid(geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]) ->
     return pixels_at(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), geometry, shape)
 
 
-def mean_one(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> Float[np.ndarray, " n"]:
+def mean_one(parameters: Parameters, x: _Vector, shape: tuple[int, int]) -> _Vector:
     """``x`` with the first coefficient of the shading that gives the map of a sensor (rows, columns) a mean of 1."""
     wire = parameters.wire(x)
     # By the midpoint rule.
@@ -58,7 +61,7 @@ class MapJacobian:
 
     value: Float[np.ndarray, " places"]
     rows: Float[np.ndarray, "n places"]
-    of_mean: Float[np.ndarray, " n"]
+    of_mean: _Vector
 
     def sigma_map(self, cov: _Cov, model: float = 0.0) -> Float32[np.ndarray, "1 16 16"]:
         """Relative sigma of the map, RMS over 16 x 16 cells; ``model`` is the relative model error."""
@@ -69,8 +72,27 @@ class MapJacobian:
         """Relative sigma of the map, RMS over the sensor; ``model`` is the relative model error."""
         return float(np.sqrt(np.mean(np.square(self.sigma_map(cov, model), dtype=np.float64))))
 
+    def posterior(self, parameters: Parameters, x: _Vector, cov: _Cov, model: float) -> Posterior[Wire]:
+        """Posterior of the fitted parameters and of the relative model error.
 
-def map_jacobian(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> MapJacobian:
+        The model error is a further modulation of unknown phase. Its cosine and sine are two more parameters, so that
+        it adds the same variance everywhere. To first order, the map's mean stays 1.
+        """
+
+        def term_at(values: Float[np.ndarray, " n_2"]) -> Wire:
+            moved, beside = values[:-2].copy(), values[-2:]
+            moved[0] -= self.of_mean @ (moved - x)
+            wire = parameters.wire(moved)
+            amplitudes = np.zeros(max(np.shape(wire.amplitudes), (1, 2, 1, 1)))
+            amplitudes[: len(wire.amplitudes)] = wire.amplitudes
+            amplitudes[0, :, 0, 0] += beside
+            return replace(wire, amplitudes=amplitudes)
+
+        factor = block_diag(square_root(cov), model * np.eye(2))
+        return Posterior(np.append(x, [0.0, 0.0]), factor, term_at)
+
+
+def map_jacobian(parameters: Parameters, x: _Vector, shape: tuple[int, int]) -> MapJacobian:
     """Jacobian of the map at ``x``, whose mean is 1, on a grid of places over a sensor (rows, columns)."""
     wire = parameters.wire(x)
     grid = _grid(wire.geometry, shape, (_PLACES, _PLACES))
@@ -188,11 +210,7 @@ class Strengths:
 
 
 def strengths_of(
-    full: Parameters,
-    matrix: Float[np.ndarray, "all all"],
-    right: Float[np.ndarray, " all"],
-    keep: Bool[np.ndarray, " all"],
-    values: Float[np.ndarray, " all"],
+    full: Parameters, matrix: _Cov, right: _Vector, keep: Bool[np.ndarray, " n"], values: _Vector
 ) -> Strengths:
     """Strengths by the normal equations of all columns, of which some are kept, with these values."""
     columns = np.full(len(full.nothing.harmonics), -1)
