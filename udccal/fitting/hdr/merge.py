@@ -104,15 +104,14 @@ def merge_bracket(
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
     notes += remarks
-    rounded_below = 0.0
-    if sensor.rounded_below_e > 0:
-        rounded_below = float(sensor.rounded_below_e) / float(times[~bracket.dropped[:, 0]].max())
+    rounded_below = float(sensor.rounded_below_e) / float(times[~bracket.dropped[:, 0]].max())
+    if rounded_below > 0:
         notes.append("Dark noise is far below a code: rounding moves dark pixels by up to half a code. Raise the gain.")
     off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
     hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
     places = (str(tuple(int(k) for k in np.unravel_index(pixel, shape))) for pixel in hits)
-    listed = outliers(off, (f"frame {i}" for i in np.flatnonzero(bracket.dropped)))
-    listed += outliers(f"{hit} is left out", places)
+    frames_out = (f"frame {i}" for i in np.flatnonzero(bracket.dropped))
+    listed = outliers(off, frames_out) + outliers(f"{hit} is left out", places)
     status = FitStatus.POOR_FIT if doubts else FitStatus.CONVERGED
     status = FitStatus.SATURATED if unknown.size and unknown.all() else status
     rate, sigma, used = (part.reshape(shape) for part in (merged.rate, merged.sigma, merged.used))

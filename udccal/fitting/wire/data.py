@@ -215,13 +215,6 @@ class Pixels(eqx.Module):
         return joined
 
 
-def pixels_at(positions_px: Float[np.ndarray, "n 2"], geometry: Geometry, shape: tuple[int, int]) -> Pixels:
-    """Pixels (x, y) of a sensor of that shape (rows, columns), without values; their number fills whole blocks."""
-    zero = np.zeros(len(positions_px))
-    site, scaled = zero.astype(np.int64), scaled_places(positions_px, shape)
-    return Pixels(ideal_points(geometry, positions_px), scaled, site, value=zero, weight=zero, place=site - 1)
-
-
 def sample_pixels(
     value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, cfa: str, other: bool = False
 ) -> Pixels:
@@ -244,8 +237,9 @@ def sample_pixels(
     positions = np.stack([x, y], axis=-1).astype(np.float64)
     seen = value[y, x].astype(np.float64)
     real = (np.arange(padded) < count) & np.isfinite(seen)
-    return replace(
-        pixels_at(positions, geometry, value.shape),
+    return Pixels(
+        ideal=ideal_points(geometry, positions),
+        scaled=scaled_places(positions, value.shape),
         site=cfa_named(cfa).site_map(rows, columns)[y, x],
         value=np.where(real, seen, 0.0),
         weight=np.where(real, 1.0, 0.0),

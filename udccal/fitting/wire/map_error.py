@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import MisfitTest, chi2_test, excess_sigma, excess_variance, sharper
 from udccal.fitting.engine.report import coarse
-from udccal.fitting.wire.data import BLOCK, Pixels, Weighed, pixels_at
+from udccal.fitting.wire.data import BLOCK, Pixels, Weighed, ideal_points, scaled_places
 from udccal.fitting.wire.jacobian import (
     LEAST_VARIANCE,
     TILES,
@@ -36,9 +36,12 @@ _Cov = Float[np.ndarray, "n n"]
 
 
 def _grid(geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]) -> Pixels:
-    """The middles of ``parts`` (down, across) of a sensor of that shape."""
+    """The middles of ``parts`` (down, across) of a sensor of that shape, without values; they fill whole blocks."""
     y, x = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip(parts, shape, strict=True))
-    return pixels_at(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), geometry, shape)
+    at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    zero = np.zeros(len(at))
+    site = zero.astype(np.int64)
+    return Pixels(ideal_points(geometry, at), scaled_places(at, shape), site, value=zero, weight=zero, place=site)
 
 
 def mean_one(parameters: Parameters, x: _Vector, shape: tuple[int, int]) -> _Vector:

@@ -195,34 +195,23 @@ def shape_sigma(start: WireStart, rules: WireRules) -> Float[np.ndarray, "10"]:
 
 
 class Kind(enum.IntEnum):
-    """Kind of a parameter, and the meaning of its four indices.
+    """Kind of a parameter; the comments say what its four indices are."""
 
-    Shading: 0, 0, Legendre degree in y and in x. Site: logarithm of the gain of one of three CFA sites, as the sum over
-    all four is 0. Amplitude: harmonic, phase, degree in y and in x. Field: harmonic, phase, carrier, degree. Shape: one
-    of ten.
-    """
-
-    SHADING = 0
-    SITE = 1
-    AMPLITUDE = 2
-    FIELD = 3
-    SHAPE = 4
+    SHADING = 0  # 0, 0, Legendre degree in y and in x
+    SITE = 1  # CFA site, 0, 0, 0: logarithm of its gain; the last site has none, as the sum over all is 0
+    AMPLITUDE = 2  # harmonic, phase, degree in y and in x
+    FIELD = 3  # harmonic, phase, carrier, degree
+    SHAPE = 4  # place in ``shape_vector``, 0, 0, 0
 
 
 @final
 @dataclass(frozen=True)
 class Parameters:
-    """The numbers of a wire that are fitted; they form the vector ``x``.
+    """The numbers of a wire that are fitted; they form the vector ``x``."""
 
-    Attributes:
-        nothing: the wire where all linear coefficients are 0; numbers that are not fitted keep their values here.
-        columns: (kind, four indices) of each parameter, kind by kind.
-        groups: group of each column; a group is kept or dropped as a whole, and -1 is always kept.
-    """
-
-    nothing: Wire
-    columns: Int[np.ndarray, "n 5"]
-    groups: Int[np.ndarray, " n"]
+    nothing: Wire  # all linear coefficients are 0; numbers that are not fitted keep their values here
+    columns: Int[np.ndarray, "n 5"]  # (kind, four indices) of each parameter, kind by kind
+    groups: Int[np.ndarray, " n"]  # of each column; a group is kept or dropped as a whole, and -1 is always kept
 
     def of(self, kind: Kind) -> Bool[np.ndarray, " n"]:
         """Mask of the parameters of this kind."""
