@@ -29,6 +29,8 @@ from udccal.numerics import in_two_threads
 from udccal.result import Outliers
 from udccal.sessions.store import Session
 
+# Tiles of the sensor, down and across, whose residuals are tested as a whole.
+TILES = (6, 8)
 # Functions are compiled for blocks of this many pixels.
 BLOCK = 4096
 Result = TypeVar("Result")
@@ -259,6 +261,12 @@ def ideal_points(geometry: Geometry, positions_px: Float[np.ndarray, "n 2"]) -> 
 def scaled_places(pixels: Float[np.ndarray, "n 2"], shape: tuple[int, int]) -> Float[np.ndarray, "n 2"]:
     """Pixels (x, y) in px, scaled to [-1, 1] over a sensor of that shape (rows, columns)."""
     return 2 * pixels / (np.array(shape[::-1]) - 1.0) - 1
+
+
+def tile_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+    """Number of the sensor's tile in which each position lies."""
+    x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(TILES[::-1]))
+    return np.asarray(y * TILES[1] + x)
 
 
 def odd_step(size: int, samples: int) -> int:

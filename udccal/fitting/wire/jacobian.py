@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, Step
-from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, weighed
+from udccal.fitting.wire.data import BLOCK, TILES, FlatNoise, Pixels, Weighed, tile_numbers, weighed
 from udccal.fitting.wire.parameters import Kind, Parameters, shape_vector
 from udccal.models.arrays import Arrayish
 from udccal.models.bessel import bessel_j0_j1, sine_cosine
@@ -29,8 +29,6 @@ from udccal.models.geometry import rotation_matrix
 from udccal.models.wire import LEAST_OPEN, Wire, legendre, waves
 from udccal.numerics import in_two_threads
 
-# Tiles of the sensor, down and across, whose residuals are tested as a whole.
-TILES = (6, 8)
 # Least residual variance in units of the noise's, so that quotients by it stay finite.
 LEAST_VARIANCE = 1e-12
 # Harmonics are filled up to multiples of these numbers, and degrees to the fit's own, so that functions are compiled
@@ -352,9 +350,3 @@ class WireProblem:
     def moved(self, place: _Numbers, step: Step) -> _Numbers:
         """The place after a step."""
         return place + step.shared
-
-
-def tile_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Number of the sensor's tile in which each position lies."""
-    x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(TILES[::-1]))
-    return np.asarray(y * TILES[1] + x)

@@ -15,16 +15,8 @@ from scipy.linalg import block_diag
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import MisfitTest, chi2_test, excess_sigma, excess_variance, sharper
 from udccal.fitting.engine.report import coarse
-from udccal.fitting.wire.data import BLOCK, Pixels, Weighed, ideal_points, scaled_places
-from udccal.fitting.wire.jacobian import (
-    LEAST_VARIANCE,
-    TILES,
-    block_jacobian,
-    rays_at,
-    tile_numbers,
-    values_at,
-    with_harmonics,
-)
+from udccal.fitting.wire.data import BLOCK, TILES, Pixels, Weighed, ideal_points, scaled_places, tile_numbers
+from udccal.fitting.wire.jacobian import LEAST_VARIANCE, block_jacobian, rays_at, values_at, with_harmonics
 from udccal.fitting.wire.parameters import Harmonics, Kind, Parameters, WireRules, WireStart, possible_harmonics
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire
