@@ -125,12 +125,6 @@ def excess_kurtosis(shape: float) -> float:
     return float(0.5 * (x[1:] ** 4 + x[:-1] ** 4) @ np.diff(p)) - 3.0
 
 
-def smeared(shape: float, harmonics: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """Characteristic function of the unit Tukey-lambda distribution, at angular frequencies ``harmonics``."""
-    quantile, probability = standard_cdf(shape)
-    return np.asarray(np.trapezoid(np.cos(np.outer(harmonics, quantile)), probability, axis=1))
-
-
 @functools.lru_cache(maxsize=128)
 def _dark_cdf(sigma_DN: float, shape: float, row_DN: float, dark_DN: float, K_DN_per_e: float) -> tuple[Grid, Grid]:
     """Places (DN from the mean) and the probability that a dark sample lies below them before rounding.

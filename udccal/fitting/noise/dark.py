@@ -8,22 +8,15 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
 
+from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.fitting.engine.misfit import chi2_tail, excess_sigma
 from udccal.fitting.engine.orders import Quantity
-from udccal.fitting.noise.codes import (
-    LOW,
-    DarkFit,
-    DarkPair,
-    Five,
-    excess_kurtosis,
-    fit_dark,
-    pair_probability,
-    row_gain,
-)
-from udccal.fitting.noise.dark_levels import Means, PerPair, dark_levels, dark_means
+from udccal.fitting.noise.codes import LOW, DarkFit, Five, excess_kurtosis, fit_dark, pair_probability, row_gain
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
+
+PerPair = Float[np.ndarray, " _"]
 
 
 @final
@@ -41,6 +34,7 @@ class DarkTerms:
     black_DN: float
     dark_DN_per_s: Quantity
     levels_cov: Float[np.ndarray, "2 2"]
+    unsteady_DN: float
     read_DN2: Quantity
     shape: Quantity
     row_DN2: Quantity
@@ -48,7 +42,6 @@ class DarkTerms:
     white: bool
     foreign: bool
     skewed: bool
-    unsteady_DN: float
     fit: DarkFit
     offsets: Pattern
 
@@ -61,34 +54,25 @@ def fit_dark_terms(
     ``curvature`` is the response's in 1/DN: dark signal bends as light does.
     """
     codes = _fit_codes(data, K_DN_per_e, start)
-    fit, row_DN2 = codes.fit, codes.row_DN**2
-    pairs = dark_means(data, fit, row_DN2 if codes.white else None)
+    fit, pairs, stack = codes.fit, _means(data, codes), data.dark_stack
     read, foreign = _read_noise(data, codes, pairs, K_DN_per_e)
     # Of one frame of the stack.
-    shot = K_DN_per_e * max(float(fit.values[1]), 0.0) * data.dark_stack.exposure_s
+    shot = K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s
     single = Quantity(read.value + shot + data.rounding_DN2, read.variance)
     if seen := data.dark_seen:
         # Its own frames say what noise the average has, whatever the distribution.
         single = Quantity(seen.near_DN2, 2 * seen.near_DN2**2 / float(seen.dof.sum()))
-    offsets = _offsets(data, codes, single)
-    levels = dark_levels(data, fit, pairs, codes.white, row_DN2, single.value, offsets, curvature)
-    return DarkTerms(
-        K_DN_per_e=K_DN_per_e,
-        curvature=curvature,
-        black_DN=levels.black_DN,
-        dark_DN_per_s=levels.current,
-        levels_cov=levels.cov,
-        read_DN2=read,
-        shape=Quantity(float(fit.values[4]), float(fit.cov[4, 4])),
-        row_DN2=codes.row,
-        dsnu_DN2=Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples),
-        white=codes.white,
-        foreign=foreign,
-        skewed=pairs.skewed,
-        unsteady_DN=levels.unsteady_DN,
-        fit=fit,
-        offsets=offsets,
-    )
+    temporal = Quantity(single.value / stack.frames, single.variance / stack.frames**2)
+    offsets = dsnu(stack.mean_DN, temporal, codes.row_DN**2 / stack.frames, data.rules.defect_sigma, data.q_DN)
+    if not codes.white:
+        # Rounding biases the average: the histograms tell the offsets.
+        sigma, pixels = float(np.hypot(fit.cov[3, 3] ** 0.5, codes.unresolved_DN2)), stack.mean_DN.size
+        offsets = replace(offsets, variance=float(fit.values[3]), sigma=sigma, samples=pixels)
+    levels = _levels(data, codes, pairs, single.value, offsets, curvature)
+    spread = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
+    shape = Quantity(float(fit.values[4]), float(fit.cov[4, 4]))
+    noise, flags = (read, shape, codes.row, spread), (codes.white, foreign, pairs.skewed)
+    return DarkTerms(K_DN_per_e, curvature, *levels, *noise, *flags, fit, offsets)
 
 
 @final
@@ -139,37 +123,6 @@ def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five | None) -> _Co
     return _Codes(fit, row, row_DN, unresolved, white)
 
 
-def _read_noise(data: NoiseMoments, codes: _Codes, pairs: Means, K_DN_per_e: float) -> tuple[Quantity, bool]:
-    """The read noise's variance, and ``DarkTerms.foreign``."""
-    fit, rules = codes.fit, data.rules
-    rate, read, variance = float(fit.values[1]), float(fit.values[2]), float(fit.cov[2, 2])
-    drifts = (pairs.rate_DN_per_s if pairs.skewed else rate) * pairs.times_s
-    expected = [read + data.rounding_DN2 + K_DN_per_e * max(drift, 0.0) for drift in drifts]
-    if not codes.white:
-        expected = _coded_variances(data.darks, fit, K_DN_per_e, codes.row_DN)
-    more = unexplained_variance(data, expected, rules.most_hits, pairs.skewed)
-    if abs(more.value) > rules.foreign_sigma * more.variance**0.5:
-        # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
-        # codes tell of the rest depends on the distribution as well.
-        depends_on = 0.0 if codes.white else 0.25 * more.value**2 + variance
-        return Quantity(max(read + more.value, 0.0), more.variance + depends_on), True
-    if read <= 1.001 * LOW[2]:
-        return Quantity(0.0, max(variance, LOW[2] ** 2)), False
-    return Quantity(read, variance), False
-
-
-def _offsets(data: NoiseMoments, codes: _Codes, single: Quantity) -> Pattern:
-    """DSNU of the stack's average, or of the histograms where rounding biases the average."""
-    stack = data.dark_stack
-    temporal = Quantity(single.value / stack.frames, single.variance / stack.frames**2)
-    offsets = dsnu(stack.mean_DN, temporal, codes.row_DN**2 / stack.frames, data.rules.defect_sigma, data.q_DN)
-    if codes.white:
-        return offsets
-    sigma = float(np.hypot(codes.fit.cov[3, 3] ** 0.5, codes.unresolved_DN2))
-    spread2, pixels = float(codes.fit.values[3]), stack.mean_DN.size
-    return replace(offsets, variance=spread2, sigma=sigma, samples=pixels)
-
-
 def _with_drawn_rows(fit: DarkFit, data: NoiseMoments, row_DN: float) -> DarkFit:
     """The fit with the error that a finite number of rows adds to its covariance.
 
@@ -188,14 +141,120 @@ def _with_drawn_rows(fit: DarkFit, data: NoiseMoments, row_DN: float) -> DarkFit
     return replace(fit, cov=cov)
 
 
-def _coded_variances(pairs: tuple[DarkPair, ...], fit: DarkFit, K_DN_per_e: float, row_DN: float) -> list[float]:
-    """Temporal variance without row noise that the fitted distribution has in each pair's codes."""
-    found = []
-    for pair in pairs:
-        p, apart = pair_probability(pair, fit.values, K_DN_per_e, row_DN, 0.0), pair.differences_DN
-        by_row = row_gain(pair, fit.values, K_DN_per_e, row_DN) * row_DN
-        found.append(float(np.sum(p * apart**2)) / (2 * float(p.sum())) - by_row**2)
-    return found
+def _line(
+    means: PerPair, variances: PerPair, times: PerPair
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], PerPair]:
+    """Black and dark current in DN per s by a line through mean signals, their covariance, and what the line leaves.
+
+    One exposure time does not tell dark current from black: all is black.
+    """
+    design = np.column_stack([np.ones_like(times), times * bool(np.ptp(times) > 0)])
+    cov = scaled_inverse(design.T @ (design / variances[:, None]))
+    values = cov @ (design.T @ (means / variances))
+    return values, cov, means - design @ values
+
+
+@final
+@dataclass(frozen=True)
+class _Means:
+    """Mean signals of the dark pairs; ``skewed``: those of all pixels, as no distribution has them.
+
+    Otherwise they are those of the histograms, and ``doubt`` is how far the mean codes would move black and dark
+    current.
+    """
+
+    times_s: PerPair
+    means_DN: PerPair
+    variances_DN2: PerPair
+    doubt: Float[np.ndarray, "2"]
+    skewed: bool = False
+
+
+def _means(data: NoiseMoments, found: _Codes) -> _Means:
+    """By the fit's distribution, unless mean codes are far off: read noise and dark current may have one tail.
+
+    Where rounding is not white, it hides the noise from frame to frame. Mean codes then tell no tail; where offsets
+    smear the rounding, they tell how far off the fit's mean is.
+    """
+    fit, dark = found.fit, data.dark_moments
+    times, codes = np.array([(pair.exposure_s, pair.mean_DN) for pair in data.darks]).T
+    fitted = times, fit.means_DN, fit.variances_DN2
+    if not fit.follows:
+        return _Means(*fitted, np.zeros(2))
+    own = fit.variances_DN2
+    if found.white:
+        own = np.array([of.temporal_DN2 / (2 * of.pixels) + found.row_DN**2 / (2 * of.height) for of in dark])
+    by_codes, cov, _ = _line(codes, own, times)
+    doubt = by_codes - _line(fit.means_DN, fit.variances_DN2, times)[0]
+    if not found.white or np.all(np.abs(doubt) <= data.rules.foreign_sigma * np.sqrt(np.diag(cov))):
+        return _Means(*fitted, doubt)
+    own = own + [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
+    return _Means(times, np.array([of.level_DN for of in dark]), own, np.zeros(2), True)
+
+
+def _kept_rounding(data: NoiseMoments, temporal_DN2: float) -> float:
+    """Variance of the rounding that a pixel with this noise keeps from frame to frame."""
+    return data.rounding_DN2 * float(np.exp(-4 * np.pi**2 * (temporal_DN2 / data.q_DN**2)))
+
+
+def _levels(
+    data: NoiseMoments, codes: _Codes, pairs: _Means, single_DN2: float, offsets: Pattern, curvature: float
+) -> tuple[float, Quantity, Float[np.ndarray, "2 2"], float]:
+    """Black, dark current, their covariance and ``DarkTerms.unsteady_DN``, by every dark exposure's mean and weight."""
+    fit, stack = codes.fit, data.dark_stack
+    means, variances, times = pairs.means_DN, pairs.variances_DN2, pairs.times_s
+    # The stack's mean is without hot pixels.
+    if fit.follows and not pairs.skewed:
+        means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
+        own = (single_DN2 / stack.frames + _kept_rounding(data, single_DN2)) / stack.mean_DN.size
+        variances = np.append(variances, own + codes.row_DN**2 / len(stack.mean_DN) / stack.frames)
+    means = means + curvature * np.maximum(means - float(fit.values[0]), 0.0) ** 2
+    (black, rate), cov, left = _line(means, variances, times)
+    apart, unsteady = bool(np.ptp(times) > 0), 0.0
+    if codes.white:
+        dof = float(len(times) - 1 - apart)
+        unsteady = excess_sigma(left**2, variances, np.ones_like(means), dof)
+        # A few exposures tell the scatter of black only roughly (Student's t).
+        unsteady *= (dof / max(dof - 2, 1)) ** 0.5
+        (black, rate), cov, _ = _line(means, variances + unsteady**2, times)
+    cov = cov + np.outer(pairs.doubt, pairs.doubt)
+    # Rounding of pixels without noise is the same in every frame.
+    cov[0, 0] += _kept_rounding(data, float(fit.values[2])) / stack.mean_DN.size
+    # All of black may be dark current.
+    cov[1, 1] = cov[1, 1] if apart else (black / max(float(times[0]), 1e-6)) ** 2
+    current = Quantity.asked("dark current", float(rate), float(cov[1, 1]), data.dark_samples)
+    by_choice = current.variance - float(cov[1, 1])
+    if not fit.follows:
+        # With coarse or cut-off codes, the errors of black, spread and noise are common to all pairs.
+        cov[[0, 1], [0, 1]] = np.maximum(np.diag(cov), np.diag(fit.cov)[:2] * [len(data.darks), 1])
+    if any(own == pair.step_DN**2 / 12.0 for own, pair in zip(fit.variances_DN2, data.darks, strict=True)):
+        # Rounding hides the same in every exposure.
+        cov[0, 0] += data.rounding_DN2
+    cov[1, 1] += by_choice
+    # Black stays that of the line: a dark current too weak to be chosen must not shift it.
+    return float(black), current, cov, unsteady
+
+
+def _read_noise(data: NoiseMoments, codes: _Codes, pairs: _Means, K_DN_per_e: float) -> tuple[Quantity, bool]:
+    """The read noise's variance, and ``DarkTerms.foreign``."""
+    values, read, variance = codes.fit.values, float(codes.fit.values[2]), float(codes.fit.cov[2, 2])
+    rate = _line(pairs.means_DN, pairs.variances_DN2, pairs.times_s)[0][1] if pairs.skewed else values[1]
+    expected = (read + data.rounding_DN2 + K_DN_per_e * np.maximum(rate * pairs.times_s, 0.0)).tolist()
+    if not codes.white:
+        # That of the fitted distribution in each pair's codes, without row noise.
+        for i, pair in enumerate(data.darks):
+            p = pair_probability(pair, values, K_DN_per_e, codes.row_DN, 0.0)
+            by_row = row_gain(pair, values, K_DN_per_e, codes.row_DN) * codes.row_DN
+            expected[i] = float(np.sum(p * pair.differences_DN**2)) / (2 * float(p.sum())) - by_row**2
+    more = unexplained_variance(data, expected, data.rules.most_hits, pairs.skewed)
+    if abs(more.value) > data.rules.foreign_sigma * more.variance**0.5:
+        # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
+        # codes tell of the rest depends on the distribution as well.
+        depends_on = 0.0 if codes.white else 0.25 * more.value**2 + variance
+        return Quantity(max(read + more.value, 0.0), more.variance + depends_on), True
+    if read <= 1.001 * LOW[2]:
+        return Quantity(0.0, max(variance, LOW[2] ** 2)), False
+    return Quantity(read, variance), False
 
 
 def unexplained_variance(
@@ -209,8 +268,8 @@ def unexplained_variance(
     from the others count only where ``of_all`` is True: hot ones have shot noise, dead ones have none.
     """
     values, variances = _temporal(data, most_hits, of_all)
-    weights = 1.0 / variances
-    return Quantity(float(np.average(values - np.asarray(expected_DN2), weights=weights)), float(1.0 / weights.sum()))
+    value = float(np.average(values - np.asarray(expected_DN2), weights=1.0 / variances))
+    return Quantity(value, float(1.0 / (1.0 / variances).sum()))
 
 
 def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
@@ -228,7 +287,7 @@ def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
     by_time = off(max(dark.dark_DN_per_s.value, 0.0) * times)
     # A sensor that warms by a degree or two changes its dark current by a fraction.
     most = 0.25 * off(np.zeros(len(times)))
-    beyond = chi2.sf(by_time, len(times) - 1) < data.rules.contradictory
+    beyond = chi2_tail(by_time, len(times) - 1) < data.rules.contradictory
     return bool(beyond and by_time > most and off(means) < 0.1 * by_time)
 
 
@@ -237,8 +296,7 @@ def _temporal(data: NoiseMoments, most_hits: float, of_all: bool) -> tuple[PerPa
     tails = sum(of.outliers for of in data.dark_moments) > most_hits * sum(of.pixels for of in data.dark_moments)
     values, variances = [], []
     for pair, of in zip(data.darks, data.dark_moments, strict=True):
-        value = (of.temporal_DN2 if of_all else of.near_DN2) + tails * of.outlier_variance_DN2
+        values.append((of.temporal_DN2 if of_all else of.near_DN2) + tails * of.outlier_variance_DN2)
         fourth = (np.sum(pair.counts * pair.differences_DN**4) + tails * of.outlier_powers[1]) / of.pixels
-        values.append(value)
-        variances.append(max(fourth / 4 - value**2, value**2) / of.pixels)
+        variances.append(max(fourth / 4 - values[-1] ** 2, values[-1] ** 2) / of.pixels)
     return np.array(values), np.maximum(variances, 1e-30)

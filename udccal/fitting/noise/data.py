@@ -21,8 +21,7 @@ Codes = UInt16[np.ndarray, "rows columns"]
 # An array, memory map, or function that loads one. Their sizes may differ until they are loaded: types compare none.
 Frame = UInt16[np.ndarray, "_rows _columns"] | UInt8[np.ndarray, "_rows _columns"] | Callable[[], np.ndarray]
 
-_LEAST_SIDE, _MOST_SIDE, _MOST_FRAMES = 16, 65536, 4096
-_LARGEST_CODE = 65535
+_LEAST_SIDE, _MOST_SIDE, _MOST_FRAMES, _LARGEST_CODE = 16, 65536, 4096, 65535
 
 
 @final
@@ -81,6 +80,17 @@ class Averaged:
     mean_DN: Float32[np.ndarray, "rows columns"]
     frames: int
 
+    def check(self, shape: tuple[int, ...]) -> None:
+        """A FitError where it is not the mean of a number of frames of ``shape``."""
+        mean = self.mean_DN
+        if not isinstance(mean, np.ndarray) or mean.dtype.kind != "f" or mean.shape != shape:
+            found = f"float array of {shape} samples, as the frames of the pairs, found {found_instead(mean)}"
+            raise FitError(f"Expected an average of the stack as {found}. Give the mean as it is, without rounding.")
+        if bad := int(np.count_nonzero(~np.isfinite(mean))):
+            found = f"found {bad} samples that are no number. Leave it out."
+            raise FitError(f"Expected codes in an average of the stack, {found}")
+        check_count(self.frames, "the frames of an average in the stack", 1, 2**31, FitError)
+
 
 @final
 @dataclass(frozen=True)
@@ -129,45 +139,43 @@ class NoiseData:
 
     def check(self) -> None:
         """Check kinds, numbers of frames, exposures and photons; a FitError names the level or stack that is wrong."""
-        self._check_kinds()
-        stack = () if self.stack is None else (self.stack.dark, self.stack.bright)
-        frames = [one for one in stack if not isinstance(one, Averaged)]
-        if max([len(self.levels), *map(len, frames)]) > _MOST_FRAMES:
-            raise FitError(f"Expected at most {_MOST_FRAMES} levels and frames of a stack. Average some first.")
-        if frames and min(map(len, frames)) < 2:
-            raise FitError("Expected at least two dark and two bright frames in the stack, found fewer. Leave it out.")
-        exposed: list[tuple[str, ExposureLevel | SpatialStack | Averaged]]
-        exposed = [(f"level {index}", level) for index, level in enumerate(self.levels)]
-        if self.stack is not None:
-            exposed.append(("the stack", self.stack))
-        exposed += [("an average of the stack", one) for one in stack if isinstance(one, Averaged)]
-        for where, one in exposed:
-            photons = 0.0 if isinstance(one, Averaged) or one.photons is None else one.photons
-            for name, value in (("an exposure in seconds", one.exposure_s), ("a number of photons", photons)):
-                check_number(value, f"{where} to have {name}", (0.0, 1e12), "Give a number of 0 or more.", FitError)
-        for index, level in enumerate(self.levels):
-            for name, pair in (("dark", level.dark), ("bright", level.bright)):
-                if len(pair) not in (0, 2):
-                    raise FitError(f"Expected two {name} frames in level {index} or none, found {len(pair)}.")
-
-    def _check_kinds(self) -> None:
-        """A FitError where levels, frames or the top code are of another kind."""
         if not isinstance(self.levels, Sequence | np.ndarray):
             raise FitError(f"Expected a sequence of exposure levels, found {found_instead(self.levels)}. Give a list.")
-        if wrong := [found_instead(one) for one in self.levels if not isinstance(one, ExposureLevel)]:
-            raise FitError(
-                f"Expected every level as an ExposureLevel, found {wrong[0]}. Give exposure and frames in one."
-            )
-        for index, level in enumerate(self.levels):
-            for name, pair in (("dark", level.dark), ("bright", level.bright)):
-                if not isinstance(pair, Sequence | np.ndarray):
-                    found = f"found {found_instead(pair)}. Leave them out where none were taken"
-                    raise FitError(f"Expected the {name} frames of level {index} as a sequence, {found}.")
-        stack = () if self.stack is None else (self.stack.dark, self.stack.bright)
-        if wrong := [type(one).__name__ for one in stack if not isinstance(one, Sequence | np.ndarray | Averaged)]:
-            raise FitError(f"Expected the stack's frames as a sequence or an average, found {wrong[0]}. Leave it out.")
         if self.top_code is not None:
             check_count(self.top_code, "top_code", 1, _LARGEST_CODE, FitError)
+        if len(self.levels) > _MOST_FRAMES:
+            raise FitError(f"Expected at most {_MOST_FRAMES} levels, found {len(self.levels)}. Leave some out.")
+        for index, level in enumerate(self.levels):
+            if not isinstance(level, ExposureLevel):
+                found = f"found {found_instead(level)}. Give exposure and frames in one"
+                raise FitError(f"Expected every level as an ExposureLevel, {found}.")
+            _check_exposure(f"level {index}", level.exposure_s, level.photons)
+            for name in ("dark", "bright"):
+                if (found := _count(f"the {name} frames of level {index}", getattr(level, name))) not in (0, 2):
+                    raise FitError(f"Expected two {name} frames in level {index} or none, found {found}.")
+        if self.stack is None:
+            return
+        _check_exposure("the stack", self.stack.exposure_s, self.stack.photons)
+        for frames in (self.stack.dark, self.stack.bright):
+            if isinstance(frames, Averaged):
+                _check_exposure("an average of the stack", frames.exposure_s)
+            elif not 2 <= (found := _count("the stack's frames", frames)) <= _MOST_FRAMES:
+                expected = f"Expected 2 to {_MOST_FRAMES} dark and as many bright frames in the stack"
+                raise FitError(f"{expected}, found {found}. Average some first, or leave the stack out.")
+
+
+def _check_exposure(where: str, exposure_s: object, photons: object = None) -> None:
+    light = 0.0 if photons is None else photons
+    for name, value in (("an exposure in seconds", exposure_s), ("a number of photons", light)):
+        check_number(value, f"{where} to have {name}", (0.0, 1e12), "Give a number of 0 or more.", FitError)
+
+
+def _count(what: str, frames: object) -> int:
+    """How many frames a sequence holds; a FitError where it is none."""
+    if not isinstance(frames, Sequence | np.ndarray):
+        found = f"found {found_instead(frames)}. Leave them out where none were taken"
+        raise FitError(f"Expected {what} as a sequence, {found}.")
+    return len(frames)
 
 
 def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
@@ -184,21 +192,6 @@ def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
     return array if array.dtype == np.uint16 else array.astype(np.uint16)
 
 
-def checked_average(average: Averaged, shape: tuple[int, ...]) -> Averaged:
-    """The average; a FitError where it is not the mean of a number of frames of ``shape``."""
-    mean, frames = average.mean_DN, average.frames
-    if not isinstance(mean, np.ndarray) or mean.dtype.kind != "f" or mean.shape != shape:
-        found = f"float array of {shape} samples, as the frames of the pairs, found {found_instead(mean)}"
-        raise FitError(f"Expected an average of the stack as {found}. Give the mean as it is, without rounding.")
-    if not np.isfinite(mean).all():
-        bad = int(mean.size - np.isfinite(mean).sum())
-        raise FitError(
-            f"Expected codes in an average of the stack, found {bad} samples that are no number. Leave it out."
-        )
-    check_count(frames, "the frames of an average in the stack", 1, 2**31, FitError)
-    return average
-
-
 def read_noise(session: Session) -> NoiseData:
     """The steps ``noise/*`` of a session; frames are read when the fit uses them.
 
@@ -209,16 +202,17 @@ def read_noise(session: Session) -> NoiseData:
     Raises:
         SessionError: when the file of an average is missing or damaged; of a frame, when it is read.
     """
-    levels, stacks = [], {}
+    levels: list[ExposureLevel] = []
+    averages: dict[str, Averaged] = {}
     for step in session.steps("noise"):
-        exposure_s = step.captures[0].exposure_s
-        if step.id.endswith("_stack"):
+        exposure_s, name = step.captures[0].exposure_s, step.id.removeprefix("noise/")
+        if name.endswith("_stack"):
             average = session.average(step.captures[0])
-            stacks[step.id] = Averaged(exposure_s, average.mean, average.frames)
+            averages[name] = Averaged(exposure_s, average.mean, average.frames)
             continue
         pair = tuple(partial(session.frame, capture) for capture in step.captures[:2])
-        lit = step.id.startswith("noise/flat_")
+        lit = name.startswith("flat_")
         levels.append(ExposureLevel(exposure_s, bright=pair) if lit else ExposureLevel(exposure_s, dark=pair))
-    dark, flat = stacks.get("noise/dark_stack"), stacks.get("noise/flat_stack")
+    dark, flat = averages.get("dark_stack"), averages.get("flat_stack")
     stack = SpatialStack(flat.exposure_s, dark, flat) if dark is not None and flat is not None else None
     return NoiseData(tuple(levels), stack, bayer=True, top_code=int(session.rig.saturation_DN))

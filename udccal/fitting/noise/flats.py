@@ -12,12 +12,11 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.noise.codes import excess_kurtosis, smeared, standard_cdf
+from udccal.fitting.noise.codes import excess_kurtosis, standard_cdf
 from udccal.fitting.noise.dark import DarkTerms
-from udccal.fitting.noise.frame_moments import Moments, stacked
-from udccal.fitting.noise.moments import NoiseMoments
-from udccal.fitting.noise.neighbours import Shared, pooled
-from udccal.fitting.noise.transfer import DarkVariance, Five, Grid, Levels, TransferFit, robust_transfer
+from udccal.fitting.noise.frame_moments import Moments, Shared, stacked
+from udccal.fitting.noise.moments import NoiseMoments, steadied
+from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]
 # Part of full samples with the last code above which that part, and not the mean, gives the level.
@@ -99,10 +98,15 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
 
 
 def shared_by_neighbours(data: NoiseMoments, curve: Curve) -> Shared:
-    """The noise of light that neighbours share: that of flats inside the range, with more noise than the read noise."""
+    """The noise of light that neighbours share, by flats inside the range with more noise than the read noise."""
     dark = min(of.temporal_DN2 for of in data.dark_moments)
     inside = zip(data.flats, curve.inside.usable, strict=False)
-    return pooled(of.shared for of, usable in inside if usable.any() and of.temporal_DN2 > 4 * dark)
+    seen = [of.shared for of, usable in inside if usable.any() and of.temporal_DN2 > 4 * dark]
+    if not seen:
+        return Shared()
+    weight = np.array([of.sigma**-2 for of in seen])
+    row, column = np.average([(of.along_row, of.along_column) for of in seen], axis=0, weights=weight)
+    return Shared(float(row), float(column), float(weight.sum() ** -0.5))
 
 
 def full_bins(data: NoiseMoments, dark: DarkTerms) -> Bins:
@@ -149,17 +153,6 @@ def piled_up(data: NoiseMoments, dark: DarkTerms) -> tuple[float, float] | None:
         return None
     # The light of unclipped pixels shifts the mean by at most the part that they have, to the pile's end.
     return level, float(np.hypot(spread / np.sqrt(count), floor / count * half * q))
-
-
-def steadied(flats: tuple[Moments, ...], variance_DN2: Grid, above_DN: Grid) -> Grid:
-    """The variances of flats without what light that differs between the frames adds to them.
-
-    Such frames differ, in addition to noise, by the bin's pattern (shading, PRNU) times that.
-    """
-    shift2 = np.stack([np.var(flat.shift_DN, axis=0, ddof=1) for flat in flats])
-    pattern2 = np.maximum(stacked(flats, "spread_DN") ** 2 - variance_DN2, 0.0)
-    pattern2 /= np.where(above_DN > 0, above_DN, np.inf) ** 2
-    return np.maximum(variance_DN2 - shift2 * pattern2, 0.0)
 
 
 def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: float) -> Levels:
@@ -231,15 +224,6 @@ def _flickering(data: NoiseMoments, dark: DarkTerms) -> tuple[int, ...]:
     return tuple(int(i) for i in lit[wrong])
 
 
-def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
-    """Conversion gain in DN per electron from moments alone, for the first fit of the dark frames."""
-    mean = stacked(data.flats, "mean_DN") - black_DN
-    variance = stacked(data.flats, "variance_DN2") - data.rounding_DN2
-    lit = mean > max(0.05 * mean.max(), 0.0)
-    # Clipping lowers the ratio and nothing raises it.
-    return max(float(np.quantile((variance[lit] - dark_DN2) / mean[lit], 0.75)), 1e-6) if lit.any() else 1.0
-
-
 def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[float, float]:
     """Level in DN at which the signal stops, with its sigma.
 
@@ -286,25 +270,44 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
         return peak - 0.5 * q + spread * z, math.sqrt(own + rows)
     # Few samples beyond the end lower the mean by this, if their noise is normal.
     lost = spread * (density + z * part) if part > 0 else 0.0
-    # Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) f(2 pi k / q) / (pi k) to the mean of noise that has the
-    # characteristic function f (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty. Tails leave
-    # more of it than normal noise does; as much as Laplace's where the fitted shape has them.
-    frequency = 2 * np.pi * np.arange(1, 8) / q
-    tails = dark.foreign or shape < -(dark.shape.variance**0.5)
-    read = 1 / (1 + 0.5 * frequency**2 * V0) if tails else smeared(shape, frequency * np.sqrt(V0))
-    left = read * np.exp(-0.5 * frequency**2 * (spread2 - V0))
-    rounding = float(np.sum(2 * (left / frequency) ** 2))
     # Where some pixels are not full, the possible shift of the mean adds to it.
     low = 0.0 if sure.any() else 0.5 * max(float(excess[chosen].mean()), 0.0)
     level = float(np.average(mean[chosen], weights=weights)) + lost
-    # Dead pixels, and those of a bin's dim end that are not full, lower its mean: by no more than they do that of the
-    # whole frame, and than they widen the bin if each is five sigma short or more.
-    short, reach = 0.0, 5 * math.hypot(spread, q)
+    short = _lowered(flats, chosen, level, spread2, data)
+    sigma2 = (
+        temporal / count + _rounding_left(dark, V0, spread2, q) + low + rows + lost**2 + short**2 + dark.unsteady_DN**2
+    )
+    return level, math.sqrt(sigma2)
+
+
+def _rounding_left(dark: DarkTerms, V0: float, spread2: float, q: int) -> float:
+    """Variance that rounding leaves in the mean of full pixels, with temporal noise V0 and ``spread2`` of all pixels.
+
+    Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) f(2 pi k / q) / (pi k) to the mean of noise that has the
+    characteristic function f (Widrow and Kollar, Quantization Noise, chapter 5). Tails leave more of it than normal
+    noise does; as much as Laplace's where the fitted shape has them.
+    """
+    frequency = 2 * np.pi * np.arange(1, 8) / q
+    if dark.foreign or dark.shape.value < -(dark.shape.variance**0.5):
+        read = 1 / (1 + 0.5 * frequency**2 * V0)
+    else:
+        quantile, probability = standard_cdf(dark.shape.value)
+        read = np.trapezoid(np.cos(np.outer(frequency * np.sqrt(V0), quantile)), probability, axis=1)
+    left = read * np.exp(-0.5 * frequency**2 * (spread2 - V0))
+    return float(np.sum(2 * (left / frequency) ** 2))
+
+
+def _lowered(flats: tuple[Moments, ...], chosen: Bins, level_DN: float, spread2: float, data: NoiseMoments) -> float:
+    """By how much dead pixels, and those of a bin's dim end that are not full, may lower the mean of the chosen bins.
+
+    They do by no more than they do that of the whole frame, and than they widen the bin if each is five sigma short or
+    more.
+    """
+    short, reach = 0.0, 5 * math.hypot(math.sqrt(spread2), data.q_DN)
     wider = np.maximum(stacked(flats, "spread_DN") ** 2 - spread2 - data.rounding_DN2, 0.0) / reach
     for of, bins, wide in zip(flats, chosen, wider, strict=True):
         if bins.any():
-            lack = np.maximum(level - np.arange(len(of.codes)), 0.0)
+            lack = np.maximum(level_DN - np.arange(len(of.codes)), 0.0)
             frame = float(of.codes @ (lack * (lack > reach))) / float(of.codes.sum())
             short = max(short, frame if bins.all() else min(frame, float(wide[bins].max())))
-    sigma2 = temporal / count + rounding + low + rows + lost**2 + short**2 + dark.unsteady_DN**2
-    return level, math.sqrt(sigma2)
+    return short

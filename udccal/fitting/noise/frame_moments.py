@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from typing import final
 
 import cv2
@@ -17,10 +18,16 @@ from jaxtyping import Float, Float32, Int
 
 from udccal.fitting.noise.codes import dark_window
 from udccal.fitting.noise.data import Averaged, Codes, NoiseRules
-from udccal.fitting.noise.neighbours import Shared, shared_noise
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
 Picture = Float32[np.ndarray, "rows columns"]
+# Rows of the sensor's middle that are enough to compare neighbours.
+MIDDLE_ROWS = 512
+
+
+def product_sum(first: Picture, second: Picture) -> float:
+    """Sum of products, without a copy; sums by rows keep single precision exact enough."""
+    return float(np.einsum("ij,ij->i", first, second).sum(dtype=np.float64))
 
 
 @functools.lru_cache(maxsize=8)
@@ -37,6 +44,45 @@ def bins(
         return np.eye(tiles * period)[tile * period + np.arange(length) % period]
 
     return groups(rows).T.copy(), groups(columns).astype(np.float32)
+
+
+@final
+@dataclass(frozen=True)
+class Shared:
+    """Correlation of a pixel's noise with that of the next of its colour along a row and along a column, and sigma."""
+
+    along_row: float = 0.0
+    along_column: float = 0.0
+    sigma: float = np.inf
+
+    @property
+    def found(self) -> bool:
+        """Whether they are no chance."""
+        return max(abs(self.along_row), abs(self.along_column)) > 5.0 * self.sigma
+
+    @property
+    def gain_factor(self) -> float:
+        """The true gain as a multiple of that found: what neighbours share is missing in the variance of each."""
+        return max((1 + 2 * self.along_row) * (1 + 2 * self.along_column), 0.0)
+
+
+def shared_noise(first: Codes, difference: Float32[np.ndarray, "rows columns"], period: int) -> Shared:
+    """Of a frame and the next one's difference from it, less the rows' means; colours repeat after ``period`` samples.
+
+    The rows in the middle are enough. Light that differs between the frames leaves a part of the picture, which a
+    regression on their sum removes: the noise of sum and difference is independent. Correlation with the third next
+    pixel is taken off: noise of columns has it as well.
+    """
+    rows, far = len(first), 3 * period
+    middle = np.s_[max((rows - MIDDLE_ROWS) // 2, 0) : (rows + MIDDLE_ROWS) // 2]
+    noise = difference[middle]
+    total = cv2.addWeighted(first[middle], 2.0, noise, 1.0, 0.0, dtype=cv2.CV_32F)
+    total -= total.mean(axis=1, keepdims=True)
+    noise = noise - np.float32(product_sum(noise, total) / max(product_sum(total, total), 1e-9)) * total
+    near, power = noise[:-far, :-far], max(product_sum(noise, noise) / noise.size, 1e-9)
+    along_row = product_sum(near, noise[:-far, period : period - far] - noise[:-far, far:])
+    along_column = product_sum(near, noise[period : period - far, :-far] - noise[far:, :-far])
+    return Shared(along_row / power / near.size, along_column / power / near.size, float(np.sqrt(2.0 / near.size)))
 
 
 @final
@@ -73,8 +119,8 @@ class Moments:
     outliers: int
     outlier_powers: tuple[float, float]
     shared: Shared
-    far: tuple[int, float] = (0, 0.0)
-    repeated: bool = False
+    far: tuple[int, float]
+    repeated: bool
 
     @property
     def frames(self) -> int:
@@ -85,6 +131,11 @@ class Moments:
     def pixels(self) -> float:
         """Pixels of a frame."""
         return float(self.samples.sum()) / self.frames
+
+    @property
+    def level_DN(self) -> float:
+        """Mean of all pixels and frames."""
+        return float(np.average(self.mean_DN, weights=self.samples))
 
     @property
     def temporal_DN2(self) -> float:
@@ -121,93 +172,92 @@ def reduce_frames(
     ``dark_step`` is the converter's step, of dark frames: pixels beyond the window of the histograms are ``far``.
     """
     source = iter(frames)
-    sums = _Sums(next(source), period, rules)
-    for number, frame in enumerate(source):
-        if dark_step and not number:
-            sums.set_apart(frame, *dark_window(sums.first, dark_step), dark_step)
+    first, second = next(source), next(source)
+    far = np.zeros(0, int)
+    if dark_step:
+        middle, reach = dark_window(first, dark_step)
+        off = (np.abs(frame - float(dark_step * middle)) for frame in (first, second))
+        far = np.flatnonzero(np.minimum(*off) > dark_step * reach)
+    sums = _Sums(first, period, rules, far)
+    for frame in chain([second], source):
         sums.add(frame)
-    rows, mean_DN = sums.mean()
-    return Averaged(exposure_s, mean_DN, len(rows)), sums.moments(exposure_s, light, rows, mean_DN)
+    return sums.reduced(exposure_s, exposure_s if light is None else light)
+
+
+def _fingerprint(frame: Codes) -> int | None:
+    """A number that tells noisy frames apart; None where most pixels have one code, so that frames may well agree."""
+    sample = frame[:: max(len(frame) // 64, 1)]
+    low, high = np.percentile(sample, [16.0, 84.0])
+    return hash(sample.tobytes()) if high > low else None
 
 
 class _Sums:
     """Sums over frames of what differs from the first one.
 
-    Of every frame, ``by_row`` has its rows' means, ``by_bin`` its bins' sums less these, ``peaks`` its largest code and
-    how many samples of each bin have it. Pixels that were ``set_apart`` have their differences in ``apart``.
+    ``seen`` has of every frame its rows' means, its bins' sums less these, its ``far`` pixels, its largest code and how
+    many samples of each bin have that.
     """
 
-    def __init__(self, first: Codes, period: int, rules: NoiseRules) -> None:
-        self.first, self._period, self._rules = first, period, rules
+    def __init__(self, first: Codes, period: int, rules: NoiseRules, far: Int[np.ndarray, " far"]) -> None:
+        self._first, self._period, self._rules, self._far = first, period, rules, far
         self._down, self._right = bins(*first.shape, period)
         self._width = self._right.sum(axis=0, dtype=np.float64)
         self._counts = np.outer(self._down.sum(axis=1), self._width)
         self._total, self._squares = np.zeros(first.shape, np.float32), np.zeros_like(self._counts)
         self._outliers, self._powers = 0, np.zeros(2)
         self._shared: Shared | None = None
-        self._by_row, self._by_bin = [np.zeros(len(first))], [np.zeros_like(self._counts)]
-        self._peaks = [self._at_peak(first)]
-        self._far, self._apart = np.zeros(0, int), [np.zeros(0)]
-
-    def set_apart(self, second: Codes, middle: int, reach: int, step: int) -> None:
-        """Pixels that lie beyond a window, in steps of codes, in the first frame and in this one."""
-        off = (np.abs(frame - float(step * middle)) for frame in (self.first, second))
-        self._far = np.flatnonzero(np.minimum(*off) > step * reach)
-        self._apart = [np.zeros(self._far.size)]
+        self._marks = [_fingerprint(first)]
+        none = np.zeros(len(first)), np.zeros_like(self._counts), np.zeros(far.size)
+        self._seen = [(*none, *self._at_peak(first))]
 
     def add(self, frame: Codes) -> None:
         """Count one more frame."""
-        difference = self._without_hits(cv2.subtract(frame, self.first, dtype=cv2.CV_32F))
-        self._by_row.append(difference.mean(axis=1, dtype=np.float64))
-        difference -= self._by_row[-1][:, None]
-        self._shared = self._shared or shared_noise(self.first, difference, self._period)
-        self._apart.append(difference.ravel()[self._far].astype(np.float64))
+        difference = self._without_hits(cv2.subtract(frame, self._first, dtype=cv2.CV_32F))
+        rows = difference.mean(axis=1, dtype=np.float64)
+        difference -= rows[:, None]
+        self._shared = self._shared or shared_noise(self._first, difference, self._period)
+        self._marks.append(_fingerprint(frame))
+        far = difference.ravel()[self._far].astype(np.float64)
+        self._seen.append((rows, self._binned(difference), far, *self._at_peak(frame)))
         self._total += difference
-        self._by_bin.append(self._binned(difference))
         self._squares += self._binned(cv2.multiply(difference, difference))
-        self._peaks.append(self._at_peak(frame))
 
-    def mean(self) -> tuple[Float[np.ndarray, "frames rows"], Picture]:
-        """The rows' means of every frame, less those of the first, and the mean picture."""
-        rows = np.stack(self._by_row)
-        mean = cv2.addWeighted(self.first, 1.0, self._total, 1.0 / len(rows), 0.0, dtype=cv2.CV_32F)
-        mean += rows.mean(axis=0)[:, None]
-        return rows, mean
-
-    def moments(
-        self, exposure_s: float, light: float | None, rows: Float[np.ndarray, "frames rows"], mean_DN: Picture
-    ) -> Moments:
-        """The moments; ``rows`` and ``mean_DN`` as from ``mean``."""
-        (number, height), counts, left = rows.shape, self._counts, np.stack(self._by_bin)
+    def reduced(self, exposure_s: float, light: float) -> tuple[Averaged, Moments]:
+        """The mean picture and the moments."""
+        rows, left, far, peaks, at_peak = (np.stack(part) for part in zip(*self._seen, strict=True))
+        (number, height), counts, marks = rows.shape, self._counts, [mark for mark in self._marks if mark]
+        mean_DN = cv2.addWeighted(self._first, 1.0, self._total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
+        mean_DN += rows.mean(axis=0)[:, None]
         left -= left.mean(axis=0)
+        rows -= rows.mean(axis=0)
         variance, dof = self._variance(left)
-        middle = float(np.median(self.first[:: max(height // 64, 1)]))
+        middle = float(np.median(self._first[:: max(height // 64, 1)]))
         about = cv2.subtract(mean_DN, middle)
         level = self._binned(about) / counts
         spatial = np.maximum(self._binned(cv2.multiply(about, about)) / counts - level**2, 0.0)
-        peak, rows = max(code for code, _ in self._peaks), rows - rows.mean(axis=0)
-        shift = (left + (rows @ self._down.T)[..., None] * self._width) / counts
         of_rows = float(np.square(rows - rows.mean(axis=1, keepdims=True)).sum())
-        return Moments(
+        moments = Moments(
             exposure_s=exposure_s,
-            light=exposure_s if light is None else light,
+            light=light,
             mean_DN=(level + middle).ravel(),
             variance_DN2=variance.ravel(),
             dof=dof.ravel(),
             samples=number * counts.ravel(),
             spread_DN=np.sqrt(spatial + np.maximum(variance, 0.0) * (1 - 1 / number)).ravel(),
-            shift_DN=shift.reshape(number, -1),
+            shift_DN=((left + (rows @ self._down.T)[..., None] * self._width) / counts).reshape(number, -1),
             rows_DN2=of_rows / ((number - 1) * max(height - 1, 1)),
             sampling_DN2=float(np.average(variance, weights=counts)) / mean_DN.shape[1],
             height=height,
-            peak_DN=peak,
-            at_peak=(sum(count for code, count in self._peaks if code == peak) / (number * counts)).ravel(),
-            codes=np.bincount(self.first.ravel()),
+            peak_DN=int(peaks.max()),
+            at_peak=(at_peak[peaks == peaks.max()].sum(axis=0) / (number * counts)).ravel(),
+            codes=np.bincount(self._first.ravel()),
             outliers=self._outliers,
             outlier_powers=(float(self._powers[0]), float(self._powers[1])),
             shared=self._shared or Shared(),
-            far=(self._far.size, float(np.var(self._apart, axis=0).sum()) * number),
+            far=(self._far.size, float(np.var(far, axis=0).sum()) * number),
+            repeated=len(set(marks)) < len(marks),
         )
+        return Averaged(exposure_s, mean_DN, number), moments
 
     def _without_hits(self, difference: Picture) -> Picture:
         """The difference with its hits set to 0, which are counted."""
@@ -225,7 +275,7 @@ class _Sums:
 
     def _variance(self, left: Float[np.ndarray, "frames groups_y groups_x"]) -> tuple[Grid, Grid]:
         """Temporal variance of one frame, and its degrees of freedom; ``left`` are the bins' sums less their mean."""
-        number, columns = len(left), self.first.shape[1]
+        number, columns = len(left), self._first.shape[1]
         dof = np.maximum((number - 1) * (self._counts * (1 - 1 / columns) - 1), 1.0)
         squares = self._squares - self._binned(cv2.multiply(self._total, self._total, scale=1.0 / number))
         squares -= np.square(left).sum(axis=0) / self._counts

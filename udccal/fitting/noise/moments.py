@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
+from jaxtyping import Float
 
 from udccal.arguments import check_kind
 from udccal.errors import FitError
@@ -20,17 +21,11 @@ from udccal.fitting.noise.data import (
     NoiseData,
     NoiseRules,
     SpatialStack,
-    checked_average,
     loaded,
 )
-from udccal.fitting.noise.frame_moments import Moments, reduce_frames
+from udccal.fitting.noise.frame_moments import Moments, reduce_frames, stacked
 
-
-def fingerprint(frame: Codes) -> int | None:
-    """A number that tells noisy frames apart; None where most pixels have one code, so that frames may well agree."""
-    sample = frame[:: max(len(frame) // 64, 1)]
-    low, high = np.percentile(sample, [16.0, 84.0])
-    return hash(sample.tobytes()) if high > low else None
+Grid = Float[np.ndarray, "levels bins"]
 
 
 def converter_step(frame: Codes) -> int:
@@ -98,6 +93,26 @@ class NoiseMoments:
         return sum(int(pair.counts.sum()) for pair in self.darks)
 
 
+def steadied(flats: tuple[Moments, ...], variance_DN2: Grid, above_DN: Grid) -> Grid:
+    """The variances of flats without what light that differs between the frames adds to them.
+
+    Such frames differ, in addition to noise, by the bin's pattern (shading, PRNU) times that.
+    """
+    shift2 = np.stack([np.var(flat.shift_DN, axis=0, ddof=1) for flat in flats])
+    pattern2 = np.maximum(stacked(flats, "spread_DN") ** 2 - variance_DN2, 0.0)
+    pattern2 /= np.where(above_DN > 0, above_DN, np.inf) ** 2
+    return np.maximum(variance_DN2 - shift2 * pattern2, 0.0)
+
+
+def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
+    """Conversion gain in DN per electron from moments alone, for the first fit of the dark frames."""
+    mean = stacked(data.flats, "mean_DN") - black_DN
+    variance = stacked(data.flats, "variance_DN2") - data.rounding_DN2
+    lit = mean > max(0.05 * mean.max(), 0.0)
+    # Clipping lowers the ratio and nothing raises it.
+    return max(float(np.quantile((variance[lit] - dark_DN2) / mean[lit], 0.75)), 1e-6) if lit.any() else 1.0
+
+
 def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     """All frames as moments and histograms for the fit; None without a dark and a bright pair."""
     check_kind(data, NoiseData, "Give it levels of exposure.", FitError)
@@ -110,38 +125,30 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     q_DN = converter_step(sample)
     metered = all(level.photons is not None for level in brights) and (stack is None or stack.photons is not None)
 
-    def moments(
-        frames: Iterable[Frame], exposure_s: float, photons: float | None = None, dark_step: int | None = None
+    def seen(
+        frames: Iterable[Frame], taken: ExposureLevel | SpatialStack, dark_step: int | None = None
     ) -> tuple[Averaged, Moments]:
-        marks: list[int] = []
-
-        def checked() -> Iterator[Codes]:
-            for frame in frames:
-                yield (codes := loaded(frame, sample.shape))
-                if mark := fingerprint(codes):
-                    marks.append(mark)
-
-        mean, found = reduce_frames(checked(), exposure_s, photons if metered else None, period, rules, dark_step)
-        return mean, replace(found, repeated=len(set(marks)) < len(marks))
+        codes, light = (loaded(frame, sample.shape) for frame in frames), taken.photons if metered else None
+        return reduce_frames(codes, taken.exposure_s, light, period, rules, dark_step)
 
     def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
         first, second = (loaded(frame, sample.shape) for frame in level.dark)
         _check_darker(first, level.exposure_s, flats)
-        own = moments((first, second), level.exposure_s, dark_step=q_DN)[1]
-        return dark_pair(first, second, level.exposure_s, q_DN, top), own
+        return dark_pair(first, second, level.exposure_s, q_DN, top), seen((first, second), level, q_DN)[1]
 
     def average(
         stack: SpatialStack, frames: Iterable[Frame] | Averaged, dark_step: int | None
     ) -> tuple[Averaged, Moments | None]:
-        if isinstance(frames, Averaged):
-            return checked_average(frames, sample.shape), None
-        return moments(frames, stack.exposure_s, stack.photons, dark_step)
+        if not isinstance(frames, Averaged):
+            return seen(frames, stack, dark_step)
+        frames.check(sample.shape)
+        return frames, None
 
     with ThreadPoolExecutor(2) as pool:
         # The stacks are the longest tasks: they go first.
         both = ((stack, stack.dark, q_DN), (stack, stack.bright, None)) if stack else ()
         tasks = [pool.submit(average, *one) for one in both]
-        flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
+        flats = tuple(pool.map(lambda level: seen(level.bright, level)[1], brights))
         peak = max(flat.peak_DN for flat in flats)
         possible = int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
         top = possible if data.top_code is None else data.top_code
@@ -154,7 +161,94 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         means = np.array([flat.mean_DN.mean() for flat in flats])
         middle = brights[int(np.argmin(np.abs(means - 0.5 * min(means.max(), top))))]
         near = min(darks, key=lambda level: abs(level.exposure_s - middle.exposure_s))
-        stacks = [(moments(near.dark, near.exposure_s)[0], None), (moments(middle.bright, middle.exposure_s)[0], None)]
+        stacks = [(seen(near.dark, near)[0], None), (seen(middle.bright, middle)[0], None)]
     (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
     pairs = histograms, dark_moments, flats
     return NoiseMoments(*pairs, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen, rules)
+
+
+# What cannot be what it is given as: copies, and stacks that contradict the pairs. The limits are wide: light,
+# temperature and black may drift between the pairs and a stack.
+_SORT = "Sort the stack's frames, or leave the stack out."
+
+
+def contradiction(data: NoiseMoments) -> str | None:
+    """A sentence on frames that cannot be what they are given as; None where nothing is wrong."""
+    return next((wrong for test in (_copies, _dark_stack, _flat_stack) for wrong in test(data)), None)
+
+
+def _copies(data: NoiseMoments) -> Iterator[str]:
+    """Noise never repeats: copies show none, and count as new measurements. Flats tell it by their variance."""
+    for name, seen in (("dark stack", data.dark_seen), ("flat stack", data.flat_seen)):
+        if seen is not None and seen.repeated:
+            expected = f"Expected noise between the {seen.frames} frames of the {name}, found copies of one frame"
+            yield f"{expected}. Give each frame once."
+    if twice := [of.exposure_s for of in data.dark_moments if of.repeated]:
+        found = f"copies of one frame at {len(twice)} exposures (the first of {twice[0]:.4g} s)"
+        yield f"Expected noise between the two frames of dark pairs, found {found}. Give two frames that were taken."
+
+
+def _dark_stack(data: NoiseMoments) -> Iterator[str]:
+    """The dark stack has the mean and the temporal noise of dark pairs, and is darker than the flats."""
+    pairs, stack, rounding = sorted(data.dark_moments, key=lambda of: of.exposure_s), data.dark_stack, data.rounding_DN2
+    means, times = np.array([of.level_DN for of in pairs]), np.array([of.exposure_s for of in pairs])
+    mean, usual = float(stack.mean_DN.mean()), float(np.interp(stack.exposure_s, times, means))
+    noise = float(np.interp(stack.exposure_s, times, [of.temporal_DN2 for of in pairs]))
+    drift = abs(usual - float(means.min())) + 3.0 * float(np.sqrt(noise + rounding))
+    # Outside the pairs' exposures, dark current changes as it does within; one exposure does not show how much.
+    outside, apart = max(stack.exposure_s - float(times[-1]), float(times[0]) - stack.exposure_s, 0.0), np.ptp(times)
+    if outside > 0:
+        drift += 1.5 * outside * float(np.ptp(means) / apart) if apart > 0 else np.inf
+    if abs(mean - usual) > drift:
+        why = "some of its frames may be lit" if mean > usual else "black may be subtracted from it"
+        found = f"found {mean:.4g} DN: {why}"
+        yield f"Expected a dark stack of about {usual:.4g} DN, as the dark pairs, {found}. {_SORT}"
+    flat = float(data.flat_stack.mean_DN.mean())
+    if mean > flat + 3.0 * float(np.sqrt(noise + rounding)) and stack.exposure_s <= data.flat_stack.exposure_s:
+        found = f"{mean:.4g} DN and a flat stack of {flat:.4g} DN: they may be exchanged"
+        yield f"Expected a dark stack darker than the flat stack, found {found}. {_SORT}"
+    if (seen := data.dark_seen) is not None:
+        more = (mean - usual) * rough_gain(data, float(means[0]), noise)
+        low, high = 0.5 * (noise + min(more, 0.0)), 2.0 * (noise + max(more, 0.0))
+        yield from _unlike("dark", seen.temporal_DN2, low, high, rounding)
+
+
+def _flat_stack(data: NoiseMoments) -> Iterator[str]:
+    """The flat stack has the light that flats of its exposure have, and their temporal noise."""
+    black, quiet = min((of.level_DN, of.temporal_DN2) for of in data.dark_moments)
+    seen, stack, flats = data.flat_seen, data.flat_stack, data.flats
+    signals, mean = np.array([of.level_DN - black for of in flats]), float(stack.mean_DN.mean()) - black
+    by_time = all(of.light == of.exposure_s for of in flats)
+    light = seen.light if seen is not None else stack.exposure_s * by_time
+    rates = [signal / of.light for signal, of in zip(signals, flats, strict=True) if of.light > 0]
+    # Brighter ones do no harm, and full pixels are as bright as any.
+    usual = min(min(rates, default=0.0) * light, float(signals.max()))
+    if mean < 0.5 * usual - 3.0 * float(np.sqrt(quiet + data.rounding_DN2)):
+        yield (
+            f"Expected a flat stack {usual:.4g} DN above black, as flats of its exposure, found {mean:.4g} DN: some of "
+            f"its frames may be dark. {_SORT}"
+        )
+    if seen is not None:
+        every = (*flats, seen)
+        above = stacked(every, "mean_DN") - black
+        steady = steadied(every, stacked(every, "variance_DN2"), above)
+        temporal = np.average(steady, axis=1, weights=stacked(every, "dof"))
+        own, signals, noise = float(temporal[-1]), np.append(signals, 0.0), np.append(temporal[:-1], quiet)
+        # Between the noise of the next dimmer and the next brighter flat, which falls where pixels are full.
+        dimmer, brighter = signals <= mean, signals >= mean
+        below = np.argmax(np.where(dimmer, signals, -np.inf)) if dimmer.any() else -1
+        next_up = float(noise[np.argmin(np.where(brighter, signals, np.inf))]) if brighter.any() else 0.0
+        risen = float(noise[below]) + rough_gain(data, black, quiet) * max(mean - float(signals[below]), 0.0)
+        low, high = min(float(noise[below]), next_up), max(risen, next_up)
+        yield from _unlike("flat", own, 0.7 * low, 1.4 * high, data.rounding_DN2)
+
+
+def _unlike(name: str, variance_DN2: float, low_DN2: float, high_DN2: float, rounding_DN2: float) -> Iterator[str]:
+    # The variance of rounding depends on where the mean lies between two codes: up to a quarter of a step squared.
+    low_DN2, high_DN2 = low_DN2 - 3 * rounding_DN2, high_DN2 + 3 * rounding_DN2
+    if not low_DN2 <= variance_DN2 <= high_DN2:
+        expected = f"Expected a temporal variance of {max(low_DN2, 0.0):.3g} to {high_DN2:.3g} DN^2 in the {name} stack"
+        yield (
+            f"{expected}, as in {name} pairs, found {variance_DN2:.3g} DN^2: its frames may be copies, averages, or of "
+            f"several scenes. {_SORT}"
+        )

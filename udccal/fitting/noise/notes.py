@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.flats import Curve, shared_by_neighbours
+from udccal.fitting.noise.frame_moments import MIDDLE_ROWS, Picture
 from udccal.fitting.noise.moments import NoiseMoments
-from udccal.fitting.noise.neighbours import sites_apart
 from udccal.fitting.noise.patterns import Pattern, rough_median
 from udccal.result import Outliers
 
@@ -60,7 +60,7 @@ def notes(
         found = f"Flats vary by {100 * uneven.structure2**0.5:.2g} % between pixels, but not as white noise does."
         yield f"{found} That counts as light, as a panel's; columns or blotches of the sensor are not in PRNU1288."
     signal = data.flat_stack.mean_DN.astype(np.float32) - np.float32(dark.black_DN)
-    if data.period == 1 and (apart := sites_apart(signal)) > 0:
+    if data.period == 1 and (apart := _sites_apart(signal)) > 0:
         found = f"The light of the 2 x 2 sites of neighbouring pixels differs by {100 * apart:.2g} %"
         yield f"{found}: the frames look like a colour mosaic, and PRNU1288 is then wrong. Give bayer=True."
     if dark.foreign:
@@ -118,3 +118,15 @@ def _missing_codes(data: NoiseMoments) -> Int[np.ndarray, " missing"]:
             beside = np.minimum(most[: -near - 1], most[near + 1 :])
             missing = np.union1d(missing, np.flatnonzero((codes[near:-near] == 0) & (beside >= 100)) * data.q_DN)
     return missing
+
+
+def _sites_apart(signal_DN: Picture) -> float:
+    """How much the light of the brightest site of 2 x 2 exceeds that of the dimmest, relative; 0 where that is chance.
+
+    The rows in the middle are enough. Rows or columns read out with two gains differ by less than a twentieth.
+    """
+    start = max((len(signal_DN) - MIDDLE_ROWS) // 4, 0) * 2
+    sites = [signal_DN[start + row : start + MIDDLE_ROWS : 2, column::2] for row in (0, 1) for column in (0, 1)]
+    light, spread = np.array([(float(one.mean()), float(one.std()) / one.size**0.5) for one in sites]).T
+    apart = float(np.ptp(light))
+    return apart / float(light.mean()) if apart > max(0.05 * abs(light.mean()), 10.0 * spread.max()) else 0.0

@@ -21,7 +21,7 @@ from scipy.special import ndtri
 from udccal.fitting.engine.misfit import excess_variance
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.noise.frame_moments import Moments
+from udccal.fitting.noise.frame_moments import product_sum
 from udccal.fitting.noise.moments import NoiseMoments
 
 Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
@@ -35,28 +35,25 @@ def row_noise(data: NoiseMoments, row_gains: Float[np.ndarray, " pairs"]) -> tup
     Rounding and cut-off codes change the variance of a pair by the square of its ``row_gains``. How much depends on the
     distribution of the read noise, which coarse codes hardly show: half of the change is in the sigma.
     """
-    nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
-    pairs = list(zip(data.dark_moments, row_gains, strict=True))
-    stack = [] if data.dark_seen is None else [(data.dark_seen, row_gains[nearest])]
+    seen, pairs = data.dark_moments, len(data.darks)
+    if data.dark_seen is not None:
+        nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
+        seen, row_gains = (*seen, data.dark_seen), np.append(row_gains, row_gains[nearest])
+    every = [(of.rows_DN2, of.sampling_DN2, (of.frames - 1) * max(of.height - 1, 1)) for of in seen]
+    # Pairs whose mean code follows black to less than a fifth do not determine row noise.
+    used = [i for i, gain in enumerate(row_gains) if gain >= 0.2 and every[i][0] > 0]
 
-    def asked(seen: list[tuple[Moments, float]]) -> Quantity:
-        # Pairs whose mean code follows black to less than a fifth do not determine row noise.
-        used = [(of, gain) for of, gain in seen if gain >= 0.2 and of.rows_DN2 > 0]
+    def asked(used: list[int]) -> Quantity:
         if not used:
             # Row noise that rounding hides completely may be as large as rounding itself.
             return Quantity.asked("row noise", 0.0, data.rounding_DN2**2, data.dark_samples, 0.0)
-        parts = np.array([(of.rows_DN2, of.sampling_DN2, (of.frames - 1) * max(of.height - 1, 1)) for of, _ in used]).T
-        gains = np.array([gain for _, gain in used])
+        rows, sampling, dof = np.array(every)[used].T
+        squares = row_gains[used] ** 2, (0.5 * (1 + row_gains[used])) ** 2
+        (value, variance, gain), (other, _, _) = (excess_variance(rows / of, sampling / of, dof) for of in squares)
+        return Quantity.asked("row noise", value, variance + (value - other) ** 2, data.dark_samples, gain)
 
-        def excess(gains: Float[np.ndarray, " used"]) -> tuple[float, float, float]:
-            return excess_variance(parts[0] / gains**2, parts[1] / gains**2, parts[2])
-
-        value, variance, gain = excess(gains)
-        by_rounding = value - excess(0.5 * (1 + gains))[0]
-        return Quantity.asked("row noise", value, variance + by_rounding**2, data.dark_samples, gain)
-
-    row = asked(pairs + stack)
-    return row, float(np.sqrt(asked(pairs).value)) if row.there else 0.0
+    row = asked(used)
+    return row, float(np.sqrt(asked([i for i in used if i < pairs]).value)) if row.there else 0.0
 
 
 @final
@@ -184,9 +181,9 @@ def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> 
     light, inverse = site.light, site.inverse_DN
     kept, good = (max(int(np.count_nonzero(mask)), 1) for mask in (white, inverse))
     power = site.power[: white.shape[0], : white.shape[1]]
-    floor = _mean_product(power, white.astype(np.float32), kept) * inverse.size / good
-    noise = temporal_DN2 * _mean_product(inverse, inverse, good) + shot_DN * _mean_product(light, inverse, good)
-    mean_square = _mean_product(light, light, good)
+    floor = product_sum(power, white.astype(np.float32)) / kept * inverse.size / good
+    noise = temporal_DN2 * product_sum(inverse, inverse) / good + shot_DN * product_sum(light, inverse) / good
+    mean_square = product_sum(light, light) / good
     square = max(mean_square - floor, 0.1)
     structure2 = mean_square - (float(light.sum(dtype=np.float64)) / good) ** 2 - floor
     seen = structure2 > 3 * floor * float(np.sqrt(2.0 / good + 2.0 / kept))
@@ -198,11 +195,6 @@ def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> 
     # The pattern of all pixels is what is asked for; the coefficients that are left out have a part of it.
     sigma2 = 2.0 * max(unlike, 1.0) / kept * (floor / square) ** 2 - 2.0 * max(variance, 0.0) ** 2 / good
     return variance, float(np.sqrt(max(sigma2, 0.0))), structure2, seen
-
-
-def _mean_product(first: np.ndarray, second: np.ndarray, count: int) -> float:
-    """Mean product over ``count`` pixels, without a copy; sums by rows keep single precision exact enough."""
-    return float(np.einsum("ij,ij->i", first, second).sum(dtype=np.float64)) / count
 
 
 def white_coefficients(powers: list[Float32[np.ndarray, "rows columns"]], taken: tuple[int, int]) -> Mask:
