@@ -12,7 +12,7 @@ from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise import codes, frame_moments
 from udccal.fitting.noise.data import Averaged, Codes, NoiseRules
 from udccal.fitting.noise.fit import fit_moments, nominal_noise
-from udccal.fitting.noise.moments import NoiseMoments, converter_step
+from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import dsnu, prnu
 from udccal.models.noise import Noise
 from udccal.result import FitResult, FitStatus
@@ -232,8 +232,8 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     dark[3, 4] = dark[50, 60] = 90.0
     assert dsnu(dark, Quantity(0.09, 0.0), 0.0, RULES.defect_sigma, 1).places == ((3, 4), (50, 60))
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
-    assert converter_step(frame) == 1
-    assert converter_step(frame * np.uint16(16)) == 16
+    assert codes.converter_step(frame) == 1
+    assert codes.converter_step(frame * np.uint16(16)) == 16
 
 
 def test_the_posterior_gives_the_sigma_of_any_function_of_the_term(fitted: tuple[Sensor, FitResult[Noise]]) -> None:

@@ -47,10 +47,8 @@ class DarkPair:
 
     @property
     def centres_DN(self) -> Float[np.ndarray, " codes"]:
-        """Middle of each group of codes; that of a cut-off end is extrapolated from its neighbours."""
-        inner = self.edges_DN[1:-1]
-        edges = np.clip(self.edges_DN, inner[0] - self.step_DN, inner[-1] + self.step_DN)
-        return np.asarray(0.5 * (edges[1:] + edges[:-1]))
+        """Middle of each group of codes."""
+        return _centres(self.edges_DN, self.step_DN)
 
     @property
     def mean_DN(self) -> float:
@@ -58,22 +56,22 @@ class DarkPair:
         both = self.counts.sum(axis=0) + self.counts.sum(axis=1)
         return float(both @ self.centres_DN) / float(both.sum())
 
-    def reaching(self, low_DN: float, high_DN: float) -> DarkPair:
-        """With empty groups of codes in addition where nothing is cut off: a window of codes cuts off tails."""
-        side, step, edges = self.counts.sum(axis=1), self.step_DN, self.edges_DN.copy()
-        # No code is cut off where none lies at the end.
-        edges[[0, -1]] = np.where(side[[0, -1]] == 0, edges[[1, -2]] + [-step, step], edges[[0, -1]])
-        below, above = (
-            int(np.ceil(max(more, 0.0) / step)) if np.isfinite(more) else 0
-            for more in (edges[0] - low_DN, high_DN - edges[-1])
-        )
-        more = (edges[0] - step * np.arange(below, 0, -1), edges, edges[-1] + step * np.arange(1, above + 1))
-        return replace(self, edges_DN=np.concatenate(more), counts=np.pad(self.counts, ((below, above),) * 2))
-
     @property
     def differences_DN(self) -> PerCode:
         """First code less the second."""
         return np.asarray(self.centres_DN[:, None] - self.centres_DN)
+
+
+def _centres(edges_DN: Grid, step_DN: float) -> Grid:
+    """Middle of each group of codes; that of a cut-off end is extrapolated from its neighbours."""
+    edges = np.clip(edges_DN, edges_DN[1] - step_DN, edges_DN[-2] + step_DN)
+    return np.asarray(0.5 * (edges[1:] + edges[:-1]))
+
+
+def converter_step(frame: Codes) -> int:
+    """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
+    codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
+    return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
 
 
 def dark_window(first: Codes, q_DN: int) -> tuple[int, int]:
@@ -170,14 +168,19 @@ def pair_probability(
 def _mean_codes(pair: DarkPair, values: Five, K_DN_per_e: float, spread_DN: float, shifts_DN: Grid) -> Grid:
     """Mean codes of samples whose signals are shifted, with offsets and row noise of normal ``spread_DN``."""
     black, per_s, variance, _, shape = (float(v) for v in values)
-    drift = per_s * pair.exposure_s
+    mean, edges, step = black + per_s * pair.exposure_s, pair.edges_DN, pair.step_DN
     # Of single codes, offsets widen the distribution as normal noise does.
-    grid, cdf = _dark_cdf(float(np.sqrt(variance)), shape, spread_DN, drift, K_DN_per_e)
-    # The window of the codes may be narrower than offsets that grow with the exposure.
-    width, reach = float(np.interp(1 - 1e-6, cdf, grid)), float(np.abs(shifts_DN).max())
-    pair = pair.reaching(black + drift - width - reach, black + drift + width + reach)
-    below = np.interp(pair.edges_DN - (black + drift + shifts_DN)[:, None], grid, cdf, left=0.0, right=1.0)
-    return np.asarray(np.diff(below, axis=1) @ pair.centres_DN)
+    grid, cdf = _dark_cdf(float(np.sqrt(variance)), shape, spread_DN, mean - black, K_DN_per_e)
+    # A window of codes cuts off tails, and may be narrower than offsets that grow with the exposure: groups are added
+    # where no code is cut off, which is so where none lies at the end.
+    reach = float(np.interp(1 - 1e-6, cdf, grid)) + float(np.abs(shifts_DN).max())
+    below, above = (max(int(np.ceil((off + reach) / step)), 1) for off in (edges[1] - mean, mean - edges[-2]))
+    whole = np.isfinite(edges[[0, -1]]) | (pair.counts.sum(axis=1)[[0, -1]] == 0)
+    first = edges[1] - step * np.arange(below, 0, -1) if whole[0] else edges[:1]
+    last = edges[-2] + step * np.arange(1, above + 1) if whole[1] else edges[-1:]
+    edges = np.concatenate([first, edges[1:-1], last])
+    lower = np.interp(edges - (mean + shifts_DN)[:, None], grid, cdf, left=0.0, right=1.0)
+    return np.asarray(np.diff(lower, axis=1) @ _centres(edges, step))
 
 
 def row_gain(pair: DarkPair, values: Five, K_DN_per_e: float, sigma_row_DN: float) -> float:
@@ -189,8 +192,8 @@ def row_gain(pair: DarkPair, values: Five, K_DN_per_e: float, sigma_row_DN: floa
     z = np.linspace(-4.0, 4.0, 33)
     shift, weights = max(sigma_row_DN, 0.01 * float(np.sqrt(values[2]))) * z, np.exp(-0.5 * z**2)
     means = _mean_codes(pair, values, K_DN_per_e, float(np.sqrt(values[3])), shift)
-    scatter, own = (float(np.cov(of, aweights=weights, ddof=0)) for of in (means, shift))
-    return float(np.sqrt(scatter / own))
+    both = np.cov(means, shift, aweights=weights, ddof=0)
+    return float(np.sqrt(both[0, 0] / both[1, 1]))
 
 
 @final
@@ -225,15 +228,10 @@ class _DarkCodes:
     sigma_row_DN: float
     rules: NoiseRules
     free: Bool[np.ndarray, "5"]
+    longest_s: float
     name: str = "noise, dark codes"
 
-    @property
-    def longest_s(self) -> float:
-        """The longest exposure."""
-        return max(max(pair.exposure_s for pair in self.pairs), 1e-9)
-
     def expected(self, pair: DarkPair, place: Five) -> PerCode:
-        """Probability of a pair's codes."""
         return pair_probability(pair, place, self.K_DN_per_e, self.sigma_row_DN, self.rules.background)
 
     def equations_at(self, place: Five) -> Blocks:
@@ -243,8 +241,8 @@ class _DarkCodes:
         score, information = -off * shape, np.outer(shape, shape)
         # Steps of differences: small compared with the noise, large compared with rounding errors.
         width2 = place[2] + 0.01
-        by_rate = width2**0.5 / self.longest_s
-        steps = 2e-3 * np.array([width2**0.5, by_rate, width2, max(0.5 * place[3], 1e-4 * width2), 1.0])
+        width, offsets = width2**0.5, max(0.5 * place[3], 1e-4 * width2)
+        steps = 2e-3 * np.array([width, width / self.longest_s, width2, offsets, 1.0])
         steps = np.where(place + steps <= _HIGH, steps, -steps)
         for pair in self.pairs:
             p, counts = self.expected(pair, place).ravel(), pair.counts.ravel()
@@ -252,8 +250,7 @@ class _DarkCodes:
             # One-sided: the second order, which remains, sums to zero in the score at the truth.
             jacobian = np.zeros((5, p.size))
             for i in np.flatnonzero(self.free):
-                moved = self.expected(pair, place + steps[i] * np.eye(5)[i])
-                jacobian[i] = (moved.ravel() - p) / steps[i]
+                jacobian[i] = (self.expected(pair, place + steps[i] * np.eye(5)[i]).ravel() - p) / steps[i]
             cost += 2 * float(np.sum(xlogy(counts, counts / (total * p))))
             score += jacobian @ (counts / p)
             information += total * (jacobian / p) @ jacobian.T
@@ -308,17 +305,18 @@ def fit_dark(
     values = np.clip(start_values(pairs) if start is None else start, LOW, _HIGH)
     free = np.array([True, len({pair.exposure_s for pair in pairs}) > 1, True, True, not normal])
     values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
-    problem = _DarkCodes(pairs, K_DN_per_e, sigma_row_DN, rules, free)
+    longest_s = max(*(pair.exposure_s for pair in pairs), 1e-9)
+    problem = _DarkCodes(pairs, K_DN_per_e, sigma_row_DN, rules, free, longest_s)
     # One-sided derivatives predict a small gain for ever.
     found = minimise(problem, values, SolverRules(least_gain=1e-3, stalled_gain=1e-4))
     values, information = found.place, found.equations.shared
     # Rounding hides no more than its own size: codes that are all the same give this bound. Noise and offsets within a
     # code may be hidden by rounding, and otherwise only by chance.
     step2 = pairs[0].step_DN ** 2 / 12.0
-    least = np.array([1 / step2, problem.longest_s**2 / step2, step2**-2, step2**-2, rules.shape_sigma**-2])
+    least = np.array([1 / step2, longest_s**2 / step2, step2**-2, step2**-2, rules.shape_sigma**-2])
     lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
     information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
-    widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
+    widen = np.sqrt([1.0, 1.0, 1.0, len(pairs), 1.0])
     cov = found.with_rest(scaled_inverse(information) * np.outer(widen, widen))
     levels = np.array([problem.level(pair, values) for pair in pairs]).T
     return DarkFit(values, cov, found.converged, bool(np.abs(levels[0] - 1).max() < rules.white), *levels)

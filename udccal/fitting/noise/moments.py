@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from udccal.arguments import check_kind
 from udccal.errors import FitError
-from udccal.fitting.noise.codes import DarkPair, dark_pair
+from udccal.fitting.noise.codes import DarkPair, converter_step, dark_pair
 from udccal.fitting.noise.data import (
     Averaged,
     Codes,
@@ -26,12 +26,6 @@ from udccal.fitting.noise.data import (
 from udccal.fitting.noise.frame_moments import Moments, reduce_frames, stacked
 
 Grid = Float[np.ndarray, "levels bins"]
-
-
-def converter_step(frame: Codes) -> int:
-    """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
-    codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
-    return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
 
 
 def _check_levels(flats: Sequence[Moments], darks: Sequence[Moments]) -> None:

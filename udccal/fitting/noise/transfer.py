@@ -26,7 +26,7 @@ from udccal.models.noise import linear_signal
 
 Grid = Float[np.ndarray, "levels bins"]
 PerLevel = Float[np.ndarray, " levels"]
-PerBin = Float[np.ndarray, " usable"]
+PerDatum = Float[np.ndarray, " data"]
 # K [DN/e], V0 [DN^2], curvature [1/DN], response [DN per light], offset of the light.
 Five = Float[np.ndarray, "5"]
 
@@ -56,14 +56,6 @@ class Levels:
         seen = self.usable.any(axis=1) & np.isfinite(self.light)
         # Levels of one exposure differ by the lamp's power, which was not measured.
         return np.asarray(seen & bool(seen.sum() > 2 and np.ptp(self.light[seen]) > 0))
-
-    @property
-    def brightness_variance(self) -> PerLevel:
-        """Relative variance of each level's brightness by shot, read and row noise."""
-        count = np.maximum(self.usable.sum(axis=1), 1)
-        mean = np.where(self.usable, self.mean_DN, 0.0).sum(axis=1) / count
-        noise = np.where(self.usable, self.variance_DN2 / self.samples, 0.0).sum(axis=1) / count**2
-        return np.asarray((noise + self.row_variance_DN2) / np.maximum(mean, 1e-9) ** 2)
 
 
 @final
@@ -96,6 +88,11 @@ class Order:
         offset, unsteady = ", exposure offset" * self.offset, ", unsteady light" * self.unsteady
         return f"response: {'curved' if self.curved else 'linear'}{offset}{unsteady}"
 
+    @property
+    def free(self) -> Bool[np.ndarray, "5"]:
+        """Which of the five parameters."""
+        return np.array([True, True, self.curved, True, self.offset])
+
 
 @final
 @dataclass(frozen=True)
@@ -127,7 +124,11 @@ def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_
 @final
 @dataclass(frozen=True)
 class TransferProblem:
-    """The solver's problem: deviance from the model; the curvature's bound, and scales of the parameters for steps."""
+    """The solver's problem: deviance from the model; the curvature's bound, and scales of the parameters for steps.
+
+    Its data are the usable variances, the estimates of V0, and how much less light the responding levels have than the
+    model, which should be 0.
+    """
 
     levels: Levels
     dark: DarkVariance
@@ -137,43 +138,46 @@ class TransferProblem:
     name: str = "noise, photon transfer"
 
     @property
-    def free(self) -> Bool[np.ndarray, "5"]:
-        """Parameters of the order."""
-        return np.array([True, True, self.order.curved, True, self.order.offset])
+    def observed(self) -> PerDatum:
+        """The data."""
+        lacking = np.zeros(int(self.levels.responding.sum()))
+        return np.concatenate([self.levels.variance_DN2[self.levels.usable], self.dark.V0_DN2, lacking])
 
-    def predicted(self, x: Five) -> tuple[PerBin, Float[np.ndarray, " points"], PerLevel]:
-        """Usable variances and estimates of V0 by the model, and how much less light than it the levels have."""
+    def predicted(self, x: Five) -> PerDatum:
+        """The data by the model."""
         K, V0, c, gain, offset = x
         levels, dark = self.levels, self.dark
         with np.errstate(divide="ignore", invalid="ignore"):
             signal = np.nan_to_num(linear_signal(np.where(levels.usable, levels.mean_DN, 0.0), c, K), posinf=0.0)
             variance = np.maximum(temporal_variance(signal[levels.usable], K, V0, c, dark.rounding_DN2), 1e-9)
             bright = _brightness(signal - levels.dark_DN[:, None], levels.usable) / (gain * (levels.light + offset))
-        return variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, (1 - bright)[levels.responding]
+        return np.concatenate([variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, (1 - bright)[levels.responding]])
 
-    def spread2(self, lacking: PerLevel) -> tuple[PerLevel, float]:
-        """Relative variance of responding levels, and the maximum-likelihood part of it that is no noise."""
-        known = self.levels.brightness_variance[self.levels.responding]
+    def variances(self, predicted: PerDatum) -> tuple[PerDatum, float]:
+        """Of the data, and the maximum-likelihood part of the light's relative variance that is no noise."""
+        of, use = self.levels, self.levels.usable
+        count, bins = np.maximum(use.sum(axis=1), 1), np.count_nonzero(use)
+        mean = np.where(use, of.mean_DN, 0.0).sum(axis=1) / count
+        noise = np.where(use, of.variance_DN2 / of.samples, 0.0).sum(axis=1) / count**2 + of.row_variance_DN2
+        known = (noise / np.maximum(mean, 1e-9) ** 2)[of.responding]
+        lacking = predicted[len(predicted) - len(known) :]
         own = excess_variance(lacking**2, known, np.ones(len(known)))[0] if self.order.unsteady else 0.0
-        return known + own, own
+        return np.concatenate([2 * predicted[:bins] ** 2 / of.dof[use], self.dark.sigma_DN2**2, known + own]), own
 
     def equations_at(self, place: Five) -> Blocks:
         """Score and Fisher information; the scatter of the light is the maximum-likelihood one at this place."""
-        levels, dark, (variance, floor, lacking) = self.levels, self.dark, self.predicted(place)
-        spread2, _ = self.spread2(lacking)
-        observed, dof = levels.variance_DN2[levels.usable], levels.dof[levels.usable]
-        off = np.concatenate([observed - variance, dark.V0_DN2 - floor, -lacking])
-        weight = np.concatenate([0.5 * dof / variance**2, dark.sigma_DN2**-2, 1 / spread2])
+        predicted, dof, seen = self.predicted(place), self.levels.dof[self.levels.usable], self.levels.responding.sum()
+        variances, _ = self.variances(predicted)
+        off, bins, jacobian = self.observed - predicted, len(dof), np.zeros((len(predicted), 5))
         # Free parameters are those of the order that the data determine.
-        free, jacobian = self.free & ((np.arange(5) < 3) | (lacking.size > 0)), np.zeros((len(off), 5))
+        free = self.order.free & ((np.arange(5) < 3) | (seen > 0))
         for i in np.flatnonzero(free):
             step = 1e-4 * self.sizes[i] * np.eye(5)[i]
-            up, down = (np.concatenate(self.predicted(place + sign * step)) for sign in (1, -1))
-            jacobian[:, i] = (up - down) / (2 * step[i])
-        ratio = np.maximum(observed / variance, 1e-12)
-        cost = float(np.sum(dof * (ratio - 1 - np.log(ratio))) + np.sum(np.log(spread2)))
-        cost += float(np.sum((weight * off**2)[len(dof) :]))
-        score, information = jacobian.T @ (weight * off), jacobian.T @ (weight[:, None] * jacobian)
+            jacobian[:, i] = (self.predicted(place + step) - self.predicted(place - step)) / (2 * step[i])
+        ratio = np.maximum(self.observed[:bins] / predicted[:bins], 1e-12)
+        cost = float(np.sum(dof * (ratio - 1 - np.log(ratio))) + np.sum(np.log(variances[len(off) - seen :])))
+        cost += float(np.sum((off**2 / variances)[bins:]))
+        score, information = jacobian.T @ (off / variances), jacobian.T @ (jacobian / variances[:, None])
         held = ~free
         held[2] |= abs(place[2]) >= self.bound and score[2] * place[2] > 0
         return replace(Blocks.dense(cost, len(off), information, score), held=held)
@@ -186,20 +190,20 @@ class TransferProblem:
 
     def attempt(self, start: Five) -> Attempt[TransferFit]:
         """The fit of the order."""
-        order, levels, usable = self.order, self.levels, self.levels.usable
-        found = minimise(self, np.where(self.free, start, 0.0))
-        cov = found.with_rest(found.equations.cov())
-        variance, _, lacking = self.predicted(found.place)
-        spread2, own = self.spread2(lacking)
-        variance_z, level_z, dof = np.full(usable.shape, np.nan), np.full(len(usable), np.nan), levels.dof[usable]
-        variance_z[usable] = (levels.variance_DN2[usable] / variance - 1) * np.sqrt(dof / 2)
-        level_z[levels.responding] = np.nan_to_num(-lacking) / np.sqrt(spread2)
-        misfit, samples = chi2_test(float(np.nansum(variance_z**2)), max(dof.size - 1.0, 1.0)), int(dof.sum())
-        parameters, scatter = order.curved + order.offset + order.unsteady, float(np.sqrt(own))
+        order, use, samples = self.order, self.levels.usable, int(self.levels.dof[self.levels.usable].sum())
+        found = minimise(self, np.where(order.free, start, 0.0))
+        predicted = self.predicted(found.place)
+        variances, own = self.variances(predicted)
+        z, bins = (self.observed - predicted) / np.sqrt(variances), np.count_nonzero(use)
+        variance_z, level_z = np.full(use.shape, np.nan), np.full(len(use), np.nan)
+        variance_z[use], level_z[self.levels.responding] = z[:bins], np.nan_to_num(z[bins + len(self.dark.V0_DN2) :])
+        misfit = chi2_test(float(np.sum(z[:bins] ** 2)), max(bins - 1.0, 1.0))
+        parameters, cov = order.curved + order.offset + order.unsteady, found.with_rest(found.equations.cov())
         criterion = bic(found.equations.cost, float(parameters), samples) if found.converged else np.inf
-        residuals = variance_z, level_z
-        fit = TransferFit(order, found.place, cov, scatter, found.converged, *residuals, misfit, samples)
-        return Attempt(order.name, parameters, criterion, fit)
+        numbers = found.place, cov, float(np.sqrt(own)), found.converged
+        return Attempt(
+            order.name, parameters, criterion, TransferFit(order, *numbers, variance_z, level_z, misfit, samples)
+        )
 
 
 def _brightness(light_DN: Grid, usable: np.ndarray) -> PerLevel:
@@ -216,16 +220,6 @@ def _brightness(light_DN: Grid, usable: np.ndarray) -> PerLevel:
     return np.asarray(level)
 
 
-def _rounding_off(variance_DN2: Grid, rounding_DN2: float) -> Grid:
-    """Relative mean square by which variances of rounded codes differ from noise plus q^2/12 (Widrow and Kollar, 2008).
-
-    It is that of the first harmonic, whose phase is the mean's place between two codes: all bins of a level share it.
-    """
-    noise = np.maximum(variance_DN2 / (12 * rounding_DN2) - 1 / 12, 0.0)
-    most = (1 / np.pi**2 + 4 * noise) * np.exp(-2 * np.pi**2 * noise)
-    return np.asarray(0.5 * (most * 12 * rounding_DN2 / np.maximum(variance_DN2, 1e-9)) ** 2)
-
-
 def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules) -> Choice[TransferFit]:
     """The order with the least BIC, its fit, and the criterion of every order; at least one bin is usable."""
     # A straight line with rough weights, and the response through the origin.
@@ -236,8 +230,13 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
     gain = float(light @ _brightness(levels.mean_DN - levels.dark_DN[:, None], use)) / max(float(light @ light), 1e-30)
     start = np.array([K, V0, 0.0, gain if gain > 0 else 1.0, 0.0])
     # A variance and the mean of its bin have correlated errors for Poisson counts, and independent ones for read noise.
-    apart = K**2 * max(V0, 0.0) / levels.samples / np.maximum(levels.variance_DN2, 1e-9) ** 2
-    apart += _rounding_off(levels.variance_DN2, dark.rounding_DN2) * levels.usable.sum(axis=1, keepdims=True)
+    variance, q2 = np.maximum(levels.variance_DN2, 1e-9), 12 * dark.rounding_DN2
+    apart = K**2 * max(V0, 0.0) / levels.samples / variance**2
+    # Variances of rounded codes differ from noise plus q^2/12 (Widrow and Kollar, 2008) by the first harmonic, whose
+    # phase is the mean's place between two codes: all bins of a level share it.
+    noise = np.maximum(levels.variance_DN2 / q2 - 1 / 12, 0.0)
+    most = q2 * (1 / np.pi**2 + 4 * noise) * np.exp(-2 * np.pi**2 * noise)
+    apart += 0.5 * (most / variance) ** 2 * use.sum(axis=1, keepdims=True)
     levels = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
     sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, max(light.max(), 1e-30)])
     simplest = TransferProblem(levels, dark, Order(), rules.most_bent / full_DN, sizes)
