@@ -174,18 +174,12 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     smeared = 2 * above / max(K, 1e-9) * (1 - np.cos(2 * np.pi * K / q))
     smeared += 4 * np.pi**2 * (dark.read_DN2.value + dark.row_DN2.value) / q**2
     usable &= (smeared >= data.rules.smeared) | (variance >= 30 * q**2)
-    return Levels(
-        mean_DN=above,
-        variance_DN2=variance,
-        dof=stacked(flats, "dof"),
-        samples=stacked(flats, "samples"),
-        usable=usable,
-        # Frames that are lit have an exposure: 0 says that it is not known.
-        light=np.array([flat.light or np.nan for flat in flats]),
-        dark_DN=dark.dark_DN_per_s.value * np.array([flat.exposure_s for flat in flats]),
-        row_variance_DN2=np.array([dark.row_DN2.value / (flat.frames * flat.height) for flat in flats])
-        + dark.unsteady_DN**2,
-    )
+    # Frames that are lit have an exposure: 0 says that it is not known.
+    light, exposure_s, rows = np.array(
+        [(of.light or np.nan, of.exposure_s, dark.row_DN2.value / (of.frames * of.height)) for of in flats]
+    ).T
+    by_bin = above, variance, stacked(flats, "dof"), stacked(flats, "samples"), usable
+    return Levels(*by_bin, light, dark.dark_DN_per_s.value * exposure_s, rows + dark.unsteady_DN**2)
 
 
 def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
@@ -235,11 +229,9 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
         # The level lies between the brightest code seen and the largest possible one.
         unseen = max(data.top_DN - max(flat.peak_DN for flat in flats), 0.0)
         return curve.pile or (data.top_DN, unseen / math.sqrt(3.0))
-    names = ("mean_DN", "variance_DN2", "dof", "samples", "at_peak")
-    mean, variance, dof, samples, at_peak = (stacked(flats, name) for name in names)
     peaks = np.array([flat.peak_DN for flat in flats])
     peak = int(peaks[full.any(axis=1)].max())
-    at_peak = at_peak * (peaks == peak)[:, None]
+    at_peak, samples = stacked(flats, "at_peak") * (peaks == peak)[:, None], stacked(flats, "samples")
     V0, row = max(float(curve.values[1]), 0.0), dark.row_DN2.value
     spread = float(np.sqrt(spread2 := V0 + dark.dsnu_DN2.value + row))
     # Bins in which most samples have the last code; of a whole frame, colours that are not full hide them.
@@ -251,8 +243,8 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
         return float(peak), max(below, 0.0) / math.sqrt(3.0)
     # Bins whose pixels are all full have no other noise, and no outliers: these would be pixels that are not full.
     temporal = V0 + data.rounding_DN2
-    excess = variance - temporal
-    sure = full & (excess < 3.0 * temporal * np.sqrt(2 / dof))
+    excess = stacked(flats, "variance_DN2") - temporal
+    sure = full & (excess < 3.0 * temporal * np.sqrt(2 / stacked(flats, "dof")))
     clean = sure & np.array([[of.frames * of.outliers <= 1e-5 * of.samples.sum()] for of in flats])
     chosen = next(bins for bins in (clean, sure, full) if bins.any())
     weights, count = samples[chosen], float(samples[chosen].sum())
@@ -261,23 +253,19 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
     seen = [of.frames * of.height * bins.mean() for of, bins in zip(flats, chosen, strict=True)]
     z, rows = float(ndtri(part)) if part > 0 else 0.0, row / float(sum(seen))
     density = math.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
-    shape = dark.shape.value
     if part > _MANY_AT_THE_END:
         own = spread2 * part * (1 - part) / density**2 / count
         # The fraction gives the level by the shape of the noise, of which the read noise's is not quite normal.
-        quantile, probability = standard_cdf(shape)
+        quantile, probability = standard_cdf(dark.shape.value)
         own += V0 * (0.2 if dark.foreign else float(np.interp(part, probability, quantile)) - z) ** 2
         return peak - 0.5 * q + spread * z, math.sqrt(own + rows)
     # Few samples beyond the end lower the mean by this, if their noise is normal.
     lost = spread * (density + z * part) if part > 0 else 0.0
     # Where some pixels are not full, the possible shift of the mean adds to it.
     low = 0.0 if sure.any() else 0.5 * max(float(excess[chosen].mean()), 0.0)
-    level = float(np.average(mean[chosen], weights=weights)) + lost
-    short = _lowered(flats, chosen, level, spread2, data)
-    sigma2 = (
-        temporal / count + _rounding_left(dark, V0, spread2, q) + low + rows + lost**2 + short**2 + dark.unsteady_DN**2
-    )
-    return level, math.sqrt(sigma2)
+    level = float(np.average(stacked(flats, "mean_DN")[chosen], weights=weights)) + lost
+    rounding, short = _rounding_left(dark, V0, spread2, q), _lowered(flats, chosen, level, spread2, data)
+    return level, math.sqrt(temporal / count + rounding + low + rows + lost**2 + short**2 + dark.unsteady_DN**2)
 
 
 def _rounding_left(dark: DarkTerms, V0: float, spread2: float, q: int) -> float:

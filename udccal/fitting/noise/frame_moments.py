@@ -160,25 +160,19 @@ def stacked(levels: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels
 
 
 def reduce_frames(
-    frames: Iterable[Codes],
-    exposure_s: float,
-    light: float | None,
-    period: int,
-    rules: NoiseRules,
-    dark_step: int | None = None,
+    frames: Iterable[Codes], exposure_s: float, light: float | None, period: int, rules: NoiseRules, dark_step: int = 0
 ) -> tuple[Averaged, Moments]:
     """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise.
 
     ``dark_step`` is the converter's step, of dark frames: pixels beyond the window of the histograms are ``far``.
     """
     source = iter(frames)
-    first, second = next(source), next(source)
-    far = np.zeros(0, int)
+    first, second, far = next(source), next(source), np.zeros(0, int)
     if dark_step:
         middle, reach = dark_window(first, dark_step)
         off = (np.abs(frame - float(dark_step * middle)) for frame in (first, second))
         far = np.flatnonzero(np.minimum(*off) > dark_step * reach)
-    sums = _Sums(first, period, rules, far)
+    sums = _Sums(first, period, rules.hit_sigma, far)
     for frame in chain([second], source):
         sums.add(frame)
     return sums.reduced(exposure_s, exposure_s if light is None else light)
@@ -198,8 +192,8 @@ class _Sums:
     many samples of each bin have that.
     """
 
-    def __init__(self, first: Codes, period: int, rules: NoiseRules, far: Int[np.ndarray, " far"]) -> None:
-        self._first, self._period, self._rules, self._far = first, period, rules, far
+    def __init__(self, first: Codes, period: int, hit_sigma: float, far: Int[np.ndarray, " far"]) -> None:
+        self._first, self._period, self._hit_sigma, self._far = first, period, hit_sigma, far
         self._down, self._right = bins(*first.shape, period)
         self._width = self._right.sum(axis=0, dtype=np.float64)
         self._counts = np.outer(self._down.sum(axis=1), self._width)
@@ -230,7 +224,13 @@ class _Sums:
         mean_DN += rows.mean(axis=0)[:, None]
         left -= left.mean(axis=0)
         rows -= rows.mean(axis=0)
-        variance, dof = self._variance(left)
+        columns, common = mean_DN.shape[1], np.square(left).sum(axis=0) / counts
+        dof = np.maximum((number - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
+        squares = self._squares - self._binned(cv2.multiply(self._total, self._total, scale=1.0 / number)) - common
+        # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
+        # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
+        mixed = squares / dof
+        variance = (mixed * (1 - 1 / columns) - (mixed @ self._width)[:, None] / columns**2) / (1 - 2 / columns)
         middle = float(np.median(self._first[:: max(height // 64, 1)]))
         about = cv2.subtract(mean_DN, middle)
         level = self._binned(about) / counts
@@ -246,7 +246,7 @@ class _Sums:
             spread_DN=np.sqrt(spatial + np.maximum(variance, 0.0) * (1 - 1 / number)).ravel(),
             shift_DN=((left + (rows @ self._down.T)[..., None] * self._width) / counts).reshape(number, -1),
             rows_DN2=of_rows / ((number - 1) * max(height - 1, 1)),
-            sampling_DN2=float(np.average(variance, weights=counts)) / mean_DN.shape[1],
+            sampling_DN2=float(np.average(variance, weights=counts)) / columns,
             height=height,
             peak_DN=int(peaks.max()),
             at_peak=(at_peak[peaks == peaks.max()].sum(axis=0) / (number * counts)).ravel(),
@@ -261,10 +261,10 @@ class _Sums:
 
     def _without_hits(self, difference: Picture) -> Picture:
         """The difference with its hits set to 0, which are counted."""
-        square, rules = cv2.multiply(difference, difference), self._rules
+        square = cv2.multiply(difference, difference)
         # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
         usual = np.median(square[:: max(len(square) // 128, 1)] @ self._right, axis=0) / self._width
-        hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
+        hits = square > max(self._hit_sigma**2 * float(usual.max()), 10.0**2)
         hits.ravel()[self._far] = False  # the shot noise of hot pixels is none
         if hits.any():
             large = square[hits].astype(np.float64)
@@ -272,18 +272,6 @@ class _Sums:
             self._powers += [large.sum(), np.square(large).sum()]
             difference[hits] = 0.0
         return difference
-
-    def _variance(self, left: Float[np.ndarray, "frames groups_y groups_x"]) -> tuple[Grid, Grid]:
-        """Temporal variance of one frame, and its degrees of freedom; ``left`` are the bins' sums less their mean."""
-        number, columns = len(left), self._first.shape[1]
-        dof = np.maximum((number - 1) * (self._counts * (1 - 1 / columns) - 1), 1.0)
-        squares = self._squares - self._binned(cv2.multiply(self._total, self._total, scale=1.0 / number))
-        squares -= np.square(left).sum(axis=0) / self._counts
-        # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
-        # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
-        mixed = squares / dof
-        variance = (mixed * (1 - 1 / columns) - (mixed @ self._width)[:, None] / columns**2) / (1 - 2 / columns)
-        return variance, dof
 
     def _binned(self, picture: Picture) -> Grid:
         return np.asarray(self._down @ (picture @ self._right))

@@ -13,16 +13,7 @@ from jaxtyping import Float
 from udccal.arguments import check_kind
 from udccal.errors import FitError
 from udccal.fitting.noise.codes import DarkPair, converter_step, dark_pair
-from udccal.fitting.noise.data import (
-    Averaged,
-    Codes,
-    ExposureLevel,
-    Frame,
-    NoiseData,
-    NoiseRules,
-    SpatialStack,
-    loaded,
-)
+from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack, loaded
 from udccal.fitting.noise.frame_moments import Moments, reduce_frames, stacked
 
 Grid = Float[np.ndarray, "levels bins"]
@@ -46,11 +37,9 @@ def _check_darker(dark: Codes, exposure_s: float, flats: Sequence[Moments]) -> N
     """
     brightest = max((float(of.mean_DN.mean()) for of in flats if of.exposure_s >= exposure_s), default=np.inf)
     if float(np.percentile(dark[::64], 25.0)) > brightest:
-        found = f"dark frames of {np.median(dark[::64]):.4g} DN and bright ones of at most {brightest:.4g} DN"
-        raise FitError(
-            f"Expected dark frames darker than bright ones of at least their {exposure_s:.4g} s, found {found}. "
-            "They may be exchanged."
-        )
+        expected = f"Expected dark frames darker than bright ones of at least their {exposure_s:.4g} s"
+        found = f"found dark frames of {np.median(dark[::64]):.4g} DN and bright ones of at most {brightest:.4g} DN"
+        raise FitError(f"{expected}, {found}. They may be exchanged.")
 
 
 @final
@@ -119,29 +108,25 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     q_DN = converter_step(sample)
     metered = all(level.photons is not None for level in brights) and (stack is None or stack.photons is not None)
 
-    def seen(
-        frames: Iterable[Frame], taken: ExposureLevel | SpatialStack, dark_step: int | None = None
-    ) -> tuple[Averaged, Moments]:
-        codes, light = (loaded(frame, sample.shape) for frame in frames), taken.photons if metered else None
-        return reduce_frames(codes, taken.exposure_s, light, period, rules, dark_step)
+    def seen(frames: Iterable[Frame], of: ExposureLevel | SpatialStack, dark_step: int = 0) -> tuple[Averaged, Moments]:
+        codes, light = (loaded(frame, sample.shape) for frame in frames), of.photons if metered else None
+        return reduce_frames(codes, of.exposure_s, light, period, rules, dark_step)
 
     def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
         first, second = (loaded(frame, sample.shape) for frame in level.dark)
         _check_darker(first, level.exposure_s, flats)
         return dark_pair(first, second, level.exposure_s, q_DN, top), seen((first, second), level, q_DN)[1]
 
-    def average(
-        stack: SpatialStack, frames: Iterable[Frame] | Averaged, dark_step: int | None
-    ) -> tuple[Averaged, Moments | None]:
+    def average(stack: SpatialStack, lit: bool) -> tuple[Averaged, Moments | None]:
+        frames = stack.bright if lit else stack.dark
         if not isinstance(frames, Averaged):
-            return seen(frames, stack, dark_step)
+            return seen(frames, stack, 0 if lit else q_DN)
         frames.check(sample.shape)
         return frames, None
 
     with ThreadPoolExecutor(2) as pool:
         # The stacks are the longest tasks: they go first.
-        both = ((stack, stack.dark, q_DN), (stack, stack.bright, None)) if stack else ()
-        tasks = [pool.submit(average, *one) for one in both]
+        tasks = [pool.submit(average, stack, lit) for lit in (False, True)] if stack else []
         flats = tuple(pool.map(lambda level: seen(level.bright, level)[1], brights))
         peak = max(flat.peak_DN for flat in flats)
         possible = int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
@@ -157,8 +142,8 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         near = min(darks, key=lambda level: abs(level.exposure_s - middle.exposure_s))
         stacks = [(seen(near.dark, near)[0], None), (seen(middle.bright, middle)[0], None)]
     (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
-    pairs = histograms, dark_moments, flats
-    return NoiseMoments(*pairs, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen, rules)
+    frames = histograms, dark_moments, flats, dark_stack, flat_stack
+    return NoiseMoments(*frames, q_DN, float(top), period, dark_seen, flat_seen, rules)
 
 
 # What cannot be what it is given as: copies, and stacks that contradict the pairs. The limits are wide: light,
@@ -175,8 +160,8 @@ def _copies(data: NoiseMoments) -> Iterator[str]:
     """Noise never repeats: copies show none, and count as new measurements. Flats tell it by their variance."""
     for name, seen in (("dark stack", data.dark_seen), ("flat stack", data.flat_seen)):
         if seen is not None and seen.repeated:
-            expected = f"Expected noise between the {seen.frames} frames of the {name}, found copies of one frame"
-            yield f"{expected}. Give each frame once."
+            expected = f"Expected noise between the {seen.frames} frames of the {name}"
+            yield f"{expected}, found copies of one frame. Give each frame once."
     if twice := [of.exposure_s for of in data.dark_moments if of.repeated]:
         found = f"copies of one frame at {len(twice)} exposures (the first of {twice[0]:.4g} s)"
         yield f"Expected noise between the two frames of dark pairs, found {found}. Give two frames that were taken."
@@ -195,8 +180,7 @@ def _dark_stack(data: NoiseMoments) -> Iterator[str]:
         drift += 1.5 * outside * float(np.ptp(means) / apart) if apart > 0 else np.inf
     if abs(mean - usual) > drift:
         why = "some of its frames may be lit" if mean > usual else "black may be subtracted from it"
-        found = f"found {mean:.4g} DN: {why}"
-        yield f"Expected a dark stack of about {usual:.4g} DN, as the dark pairs, {found}. {_SORT}"
+        yield f"Expected a dark stack of about {usual:.4g} DN, as the dark pairs, found {mean:.4g} DN: {why}. {_SORT}"
     flat = float(data.flat_stack.mean_DN.mean())
     if mean > flat + 3.0 * float(np.sqrt(noise + rounding)) and stack.exposure_s <= data.flat_stack.exposure_s:
         found = f"{mean:.4g} DN and a flat stack of {flat:.4g} DN: they may be exchanged"
@@ -218,10 +202,8 @@ def _flat_stack(data: NoiseMoments) -> Iterator[str]:
     # Brighter ones do no harm, and full pixels are as bright as any.
     usual = min(min(rates, default=0.0) * light, float(signals.max()))
     if mean < 0.5 * usual - 3.0 * float(np.sqrt(quiet + data.rounding_DN2)):
-        yield (
-            f"Expected a flat stack {usual:.4g} DN above black, as flats of its exposure, found {mean:.4g} DN: some of "
-            f"its frames may be dark. {_SORT}"
-        )
+        expected = f"Expected a flat stack {usual:.4g} DN above black, as flats of its exposure"
+        yield f"{expected}, found {mean:.4g} DN: some of its frames may be dark. {_SORT}"
     if seen is not None:
         every = (*flats, seen)
         above = stacked(every, "mean_DN") - black
@@ -242,7 +224,5 @@ def _unlike(name: str, variance_DN2: float, low_DN2: float, high_DN2: float, rou
     low_DN2, high_DN2 = low_DN2 - 3 * rounding_DN2, high_DN2 + 3 * rounding_DN2
     if not low_DN2 <= variance_DN2 <= high_DN2:
         expected = f"Expected a temporal variance of {max(low_DN2, 0.0):.3g} to {high_DN2:.3g} DN^2 in the {name} stack"
-        yield (
-            f"{expected}, as in {name} pairs, found {variance_DN2:.3g} DN^2: its frames may be copies, averages, or of "
-            f"several scenes. {_SORT}"
-        )
+        found = f"found {variance_DN2:.3g} DN^2: its frames may be copies, averages, or of several scenes"
+        yield f"{expected}, as in {name} pairs, {found}. {_SORT}"

@@ -184,9 +184,8 @@ class TransferProblem:
 
     def moved(self, place: Five, step: Step) -> Five:
         """The place after a step, with the curvature inside its bound."""
-        x = place + step.shared
-        x[2] = np.clip(x[2], -self.bound, self.bound)
-        return x
+        most = np.array([np.inf, np.inf, self.bound, np.inf, np.inf])
+        return np.clip(place + step.shared, -most, most)
 
     def attempt(self, start: Five) -> Attempt[TransferFit]:
         """The fit of the order."""
