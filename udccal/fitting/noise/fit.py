@@ -11,7 +11,7 @@ from jaxtyping import Float
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.noise.codes import start_values
+from udccal.fitting.noise.codes import Five, start_values
 from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms, unlike_exposures
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, shared_by_neighbours
@@ -67,11 +67,9 @@ def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules |
 
 def fit_moments(data: NoiseMoments, nominal: Noise) -> FitResult[Noise]:
     """Fit the noise term to frames that are reduced; ``nominal`` is returned as the term where no fit is possible."""
-    if refused := _too_little(data):
+    start = start_values(data.darks) if data.darks else np.zeros(5)
+    if refused := _too_little(data, start):
         return FitResult.failed("noise", nominal, *refused)
-    if wrong := contradiction(data):
-        return FitResult.failed("noise", nominal, FitStatus.POOR_FIT, wrong)
-    start = start_values(data.darks)
     dark = fit_dark_terms(data, rough_gain(data, float(start[0]), float(start[2])), start)
     curve = fit_curve(data, dark)
     below = [float(np.median(of.mean_DN + 4 * of.spread_DN)) < curve.ceiling_DN for of in data.dark_moments]
@@ -92,33 +90,29 @@ def fit_moments(data: NoiseMoments, nominal: Noise) -> FitResult[Noise]:
             break
         dark = fit_dark_terms(data, K, dark.fit.values, c)
         curve = fit_curve(data, dark)
-    if refused := _no_gain(data, dark, curve):
-        return FitResult.failed("noise", nominal, *refused)
-    if dark.white and unlike_exposures(data, dark):
-        note = "The noise of dark frames does not rise with exposure as dark current's would. Check exposure times."
-        return FitResult.failed("noise", nominal, FitStatus.POOR_FIT, note)
-    return _assembled(data, dark, curve)
+    refused = _no_gain(data, dark, curve)
+    return FitResult.failed("noise", nominal, *refused) if refused else _assembled(data, dark, curve)
 
 
-def _too_little(data: NoiseMoments) -> tuple[FitStatus, str] | None:
-    """The status and sentence of data that cannot be fitted; None where the fit may begin."""
+def _too_little(data: NoiseMoments, start: Five) -> tuple[FitStatus, str] | None:
+    """The status and sentence of data that cannot be fitted; None where the fit may begin from ``start``."""
     darks, flats, least = len(data.darks), len(data.flats), data.rules.levels
     if darks < 2 or flats < least:
         found = f"found {darks} and {flats}"
         return FitStatus.TOO_FEW_DATA, f"Expected at least 2 dark and {least} flat exposures, {found}."
     if any(pair.counts.sum() < 100 for pair in data.darks):
         return FitStatus.TOO_FEW_DATA, "A dark pair holds fewer than 100 samples of like codes."
-    start = start_values(data.darks)
     brightest = max(float(np.median(flat.mean_DN)) for flat in data.flats) - float(start[0])
     if brightest < 0.05 * float(np.sqrt(start[2])):
         return FitStatus.TOO_DARK, f"The brightest flat lies {brightest:.3g} DN above black."
     if any(pair.edges_DN[-1] == np.inf and pair.counts[-1].sum() > 0.5 * pair.counts.sum() for pair in data.darks):
         return FitStatus.SATURATED, "Dark frames lie at the converter's largest code. Lower the black level."
-    return None
+    wrong = contradiction(data)
+    return (FitStatus.POOR_FIT, wrong) if wrong else None
 
 
 def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[FitStatus, str] | None:
-    """Status and sentence where darks do not show black, or flats are copies, too few, too dark, or clipped."""
+    """Status and sentence where darks show no black or other exposures, or flats are copies, too few, dark or full."""
     # With codes cut off at 0 and offsets of pixels far larger than their noise, no code shows black.
     cut = any(pair.edges_DN[0] == -np.inf and pair.counts[0].sum() > 0.01 * pair.counts.sum() for pair in data.darks)
     quiet = max(dark.read_DN2.value + dark.row_DN2.value, 1e-9)
@@ -129,10 +123,8 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[FitStat
     above, levels, least = stacked(data.flats, "mean_DN") - dark.black_DN, curve.levels, data.rules.levels
     lit = stacked(data.flats, "variance_DN2")[(above > 0) & (above < 0.9 * full_DN)]
     if lit.size and float(np.median(lit)) < 0.3 * (dark.read_DN2.value + data.rounding_DN2):
-        return FitStatus.POOR_FIT, (
-            f"Expected the variance of flats to grow with their mean, found a slope of {K:.3g} DN per electron: the "
-            "two frames of a pair may be copies of each other."
-        )
+        found = f"found a slope of {K:.3g} DN per electron: the two frames of a pair may be copies of each other"
+        return FitStatus.POOR_FIT, f"Expected the variance of flats to grow with their mean, {found}."
     if curve.usable_levels < least:
         wanted = f"at least {least} flat exposures between the dark noise and 90 % of saturation"
         status = FitStatus.SATURATED if curve.full.any() else FitStatus.TOO_DARK
@@ -149,6 +141,9 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[FitStat
     median = rough_median(data.flat_stack.mean_DN)
     if median > curve.ceiling_DN - 4 * float(np.sqrt(K * max(full_DN, 1.0))):
         return FitStatus.SATURATED, f"The flat stack's median is {median:.4g} DN."
+    if dark.white and unlike_exposures(data, dark):
+        note = "The noise of dark frames does not rise with exposure as dark current's would. Check exposure times."
+        return FitStatus.POOR_FIT, note
     return None
 
 
@@ -183,12 +178,10 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     PRNU2 = Quantity.asked("PRNU", uneven.variance, uneven.sigma**2, uneven.samples)
     values, cov = _values(data, dark, curve, saturation, PRNU2)
     bent_too_far = abs(float(fit.values[2])) * max(curve.ceiling_DN - dark.black_DN, 1.0) >= 0.999 * rules.most_bent
-    converged = fit.converged and (dark.fit.converged or dark.foreign)
-    status = FitStatus.CONVERGED if converged else FitStatus.NOT_CONVERGED
     shared = shared_by_neighbours(data, curve)
     linked = shared.found and abs(shared.gain_factor - 1) > rules.most_shared
-    if fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked:
-        status = FitStatus.POOR_FIT
+    poor, converged = fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked, dark.fit.converged or dark.foreign
+    status = FitStatus.CONVERGED if fit.converged and converged else FitStatus.NOT_CONVERGED
     shown = len(NAMES) - (not fit.order.curved)
     terms = (dark.row_DN2, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
     candidates = [*(one for term in terms for one in term.candidates), *response.candidates]
@@ -200,7 +193,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     return FitResult(
         name="noise",
         term=_term(values[:shown]),
-        status=status,
+        status=FitStatus.POOR_FIT if poor else status,
         estimates=estimates("noise", NAMES[:shown], values[:shown], cov[:shown, :shown]),
         cov=cov[:shown, :shown],
         chi2_dof=fit.misfit.ratio,
@@ -219,7 +212,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
             Diagnostic("dark_samples_outside_histogram", float(outside), "1"),
             Diagnostic("edge_gain", float(np.sqrt(np.mean(dark.fit.edge_gains**2))), "1"),
         ),
-        notes=tuple(notes(data, dark, curve, uneven, values, bent_too_far)),
+        notes=tuple(notes(data, dark, curve, uneven, shared, values, bent_too_far)),
         outliers=tuple(one for one in left_out(data, dark, curve, uneven, float(values[2])) if one.count),
         residuals=residual_sample(places[np.nonzero(used)[1]], fit.variance_z[used]),
         posterior=Posterior.from_cov(values[:shown], cov[:shown, :shown], _term),
@@ -227,7 +220,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
 
 
 def _term(values: Float[np.ndarray, " shown"]) -> Noise:
-    return Noise(*(float(value) for value in values))
+    return Noise(*values.tolist())
 
 
 def _values(

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.noise.dark import DarkTerms
-from udccal.fitting.noise.flats import Curve, shared_by_neighbours
-from udccal.fitting.noise.frame_moments import MIDDLE_ROWS, Picture
+from udccal.fitting.noise.flats import Curve
+from udccal.fitting.noise.frame_moments import MIDDLE_ROWS, Picture, Shared
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, rough_median
 from udccal.result import Outliers
@@ -20,8 +20,7 @@ def left_out(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, uneven: Pattern, saturation_DN: float
 ) -> Iterator[Outliers]:
     """Samples that are left out, by rule; some of these are empty."""
-    names = [f"flat {i} ({flat.exposure_s:.4g} s)" for i, flat in enumerate(data.flats)]
-    names.append("flat stack")
+    names = [*(f"flat {i} ({flat.exposure_s:.4g} s)" for i, flat in enumerate(data.flats)), "flat stack"]
     # Unclipped samples stand out among clipped ones; that is no defect.
     ceiling = saturation_DN - 0.1 * (curve.ceiling_DN - dark.black_DN)
     seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
@@ -39,13 +38,9 @@ def left_out(
 
 
 def notes(
-    data: NoiseMoments,
-    dark: DarkTerms,
-    curve: Curve,
-    uneven: Pattern,
-    values: Float[np.ndarray, "11"],
-    bent_too_far: bool,
-) -> Iterator[str]:
+    data: NoiseMoments, dark: DarkTerms, curve: Curve, uneven: Pattern, shared: Shared,
+    values: Float[np.ndarray, "11"], bent_too_far: bool,
+) -> Iterator[str]:  # fmt: skip
     """Sentences for a person; ``values`` are the estimates."""
     if not (curve.full.any() or curve.pile):
         yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
@@ -90,7 +85,7 @@ def notes(
         found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
         yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
         yield "PRNU1288 holds for the photon transfer curve as fitted, which the variances do not follow."
-    if (shared := shared_by_neighbours(data, curve)).found:
+    if shared.found:
         found = f"{shared.along_row:.2g} along rows, {shared.along_column:.2g} along columns"
         yield (
             f"Neighbouring pixels share their noise (correlation {found}), as where a camera filters its frames. The "

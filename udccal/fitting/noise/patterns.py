@@ -219,8 +219,7 @@ def white_coefficients(powers: list[Float32[np.ndarray, "rows columns"]], taken:
         wide[: 2 * (row + 1), : 2 * (column + 1)] = True
     # Where that leaves less than a tenth, all coefficients without visible light are used.
     left_out = wide if count[~wide].sum() >= 0.1 * keep.size else seen
-    white = np.zeros_like(keep)
-    blocks = np.repeat(np.repeat(~left_out, block, axis=0), block, axis=1)
+    white, blocks = np.zeros_like(keep), np.kron(~left_out, np.ones((block, block), bool))
     white[: blocks.shape[0], : blocks.shape[1]] = blocks
     return white & keep
 
