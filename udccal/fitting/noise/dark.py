@@ -53,9 +53,10 @@ def fit_dark_terms(
 
     ``curvature`` is the response's in 1/DN: dark signal bends as light does.
     """
-    codes = _fit_codes(data, K_DN_per_e, start)
-    fit, pairs, stack = codes.fit, _means(data, codes), data.dark_stack
-    read, foreign = _read_noise(data, codes, pairs, K_DN_per_e)
+    codes, stack = _fit_codes(data, K_DN_per_e, start), data.dark_stack
+    fit, doubt, skewed = _with_means(data, codes)
+    codes = replace(codes, fit=fit)
+    read, foreign = _read_noise(data, codes, K_DN_per_e, skewed)
     # Of one frame of the stack.
     shot = K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s
     single = Quantity(read.value + shot + data.rounding_DN2, read.variance)
@@ -68,10 +69,12 @@ def fit_dark_terms(
         # Rounding biases the average: the histograms tell the offsets.
         sigma, pixels = float(np.hypot(fit.cov[3, 3] ** 0.5, codes.unresolved_DN2)), stack.mean_DN.size
         offsets = replace(offsets, variance=float(fit.values[3]), sigma=sigma, samples=pixels)
-    levels = _levels(data, codes, pairs, single.value, offsets, curvature)
+    # The stack's mean is without hot pixels.
+    more = (offsets.mean, single.value) if fit.follows and not skewed else None
+    levels = _levels(data, codes, doubt, more, curvature)
     spread = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
     shape = Quantity(float(fit.values[4]), float(fit.cov[4, 4]))
-    noise, flags = (read, shape, codes.row, spread), (codes.white, foreign, pairs.skewed)
+    noise, flags = (read, shape, codes.row, spread), (codes.white, foreign, skewed)
     return DarkTerms(K_DN_per_e, curvature, *levels, *noise, *flags, fit, offsets)
 
 
@@ -154,42 +157,25 @@ def _line(
     return values, cov, means - design @ values
 
 
-@final
-@dataclass(frozen=True)
-class _Means:
-    """Mean signals of the dark pairs; ``skewed``: those of all pixels, as no distribution has them.
+def _with_means(data: NoiseMoments, found: _Codes) -> tuple[DarkFit, Float[np.ndarray, "2"], bool]:
+    """The fit with the mean signals of the dark pairs, how far mean codes would move black and dark current, and
+    ``DarkTerms.skewed``.
 
-    Otherwise they are those of the histograms, and ``doubt`` is how far the mean codes would move black and dark
-    current.
-    """
-
-    times_s: PerPair
-    means_DN: PerPair
-    variances_DN2: PerPair
-    doubt: Float[np.ndarray, "2"]
-    skewed: bool = False
-
-
-def _means(data: NoiseMoments, found: _Codes) -> _Means:
-    """By the fit's distribution, unless mean codes are far off: read noise and dark current may have one tail.
-
-    Where rounding is not white, it hides the noise from frame to frame. Mean codes then tell no tail; where offsets
-    smear the rounding, they tell how far off the fit's mean is.
+    Means are those of the fit's distribution, unless mean codes are far off: read noise and dark current may have one
+    tail. Then they are those of all pixels. Where rounding is not white, it hides the noise from frame to frame. Mean
+    codes then tell no tail; where offsets smear the rounding, they tell how far off the fit's mean is.
     """
     fit, dark = found.fit, data.dark_moments
-    times, codes = np.array([(pair.exposure_s, pair.mean_DN) for pair in data.darks]).T
-    fitted = times, fit.means_DN, fit.variances_DN2
     if not fit.follows:
-        return _Means(*fitted, np.zeros(2))
-    own = fit.variances_DN2
-    if found.white:
-        own = np.array([of.temporal_DN2 / (2 * of.pixels) + found.row_DN**2 / (2 * of.height) for of in dark])
-    by_codes, cov, _ = _line(codes, own, times)
+        return fit, np.zeros(2), False
+    times, codes = np.array([(pair.exposure_s, pair.mean_DN) for pair in data.darks]).T
+    own = np.array([of.temporal_DN2 / (2 * of.pixels) + found.row_DN**2 / (2 * of.height) for of in dark])
+    by_codes, cov, _ = _line(codes, own if found.white else fit.variances_DN2, times)
     doubt = by_codes - _line(fit.means_DN, fit.variances_DN2, times)[0]
     if not found.white or np.all(np.abs(doubt) <= data.rules.foreign_sigma * np.sqrt(np.diag(cov))):
-        return _Means(*fitted, doubt)
-    own = own + [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
-    return _Means(times, np.array([of.level_DN for of in dark]), own, np.zeros(2), True)
+        return fit, doubt, False
+    own += [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
+    return replace(fit, means_DN=np.array([of.level_DN for of in dark]), variances_DN2=own), np.zeros(2), True
 
 
 def _kept_rounding(data: NoiseMoments, temporal_DN2: float) -> float:
@@ -198,15 +184,17 @@ def _kept_rounding(data: NoiseMoments, temporal_DN2: float) -> float:
 
 
 def _levels(
-    data: NoiseMoments, codes: _Codes, pairs: _Means, single_DN2: float, offsets: Pattern, curvature: float
+    data: NoiseMoments, codes: _Codes, doubt: Float[np.ndarray, "2"], more: tuple[float, float] | None, curvature: float
 ) -> tuple[float, Quantity, Float[np.ndarray, "2 2"], float]:
-    """Black, dark current, their covariance and ``DarkTerms.unsteady_DN``, by every dark exposure's mean and weight."""
-    fit, stack = codes.fit, data.dark_stack
-    means, variances, times = pairs.means_DN, pairs.variances_DN2, pairs.times_s
-    # The stack's mean is without hot pixels.
-    if fit.follows and not pairs.skewed:
-        means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
-        own = (single_DN2 / stack.frames + _kept_rounding(data, single_DN2)) / stack.mean_DN.size
+    """Black, dark current, their covariance and ``DarkTerms.unsteady_DN``, by every dark exposure's mean and weight.
+
+    ``more`` is the stack's mean, and the temporal variance of one of its frames.
+    """
+    fit, stack, times = codes.fit, data.dark_stack, np.array([pair.exposure_s for pair in data.darks])
+    means, variances = fit.means_DN, fit.variances_DN2
+    if more:
+        means, times = np.append(means, more[0]), np.append(times, stack.exposure_s)
+        own = (more[1] / stack.frames + _kept_rounding(data, more[1])) / stack.mean_DN.size
         variances = np.append(variances, own + codes.row_DN**2 / len(stack.mean_DN) / stack.frames)
     means = means + curvature * np.maximum(means - float(fit.values[0]), 0.0) ** 2
     (black, rate), cov, left = _line(means, variances, times)
@@ -217,7 +205,7 @@ def _levels(
         # A few exposures tell the scatter of black only roughly (Student's t).
         unsteady *= (dof / max(dof - 2, 1)) ** 0.5
         (black, rate), cov, _ = _line(means, variances + unsteady**2, times)
-    cov = cov + np.outer(pairs.doubt, pairs.doubt)
+    cov = cov + np.outer(doubt, doubt)
     # Rounding of pixels without noise is the same in every frame.
     cov[0, 0] += _kept_rounding(data, float(fit.values[2])) / stack.mean_DN.size
     # All of black may be dark current.
@@ -235,18 +223,19 @@ def _levels(
     return float(black), current, cov, unsteady
 
 
-def _read_noise(data: NoiseMoments, codes: _Codes, pairs: _Means, K_DN_per_e: float) -> tuple[Quantity, bool]:
+def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float, skewed: bool) -> tuple[Quantity, bool]:
     """The read noise's variance, and ``DarkTerms.foreign``."""
-    values, read, variance = codes.fit.values, float(codes.fit.values[2]), float(codes.fit.cov[2, 2])
-    rate = _line(pairs.means_DN, pairs.variances_DN2, pairs.times_s)[0][1] if pairs.skewed else values[1]
-    expected = (read + data.rounding_DN2 + K_DN_per_e * np.maximum(rate * pairs.times_s, 0.0)).tolist()
+    fit, values, times = codes.fit, codes.fit.values, np.array([pair.exposure_s for pair in data.darks])
+    read, variance = float(values[2]), float(fit.cov[2, 2])
+    rate = _line(fit.means_DN, fit.variances_DN2, times)[0][1] if skewed else values[1]
+    expected = (read + data.rounding_DN2 + K_DN_per_e * np.maximum(rate * times, 0.0)).tolist()
     if not codes.white:
         # That of the fitted distribution in each pair's codes, without row noise.
         for i, pair in enumerate(data.darks):
             p = pair_probability(pair, values, K_DN_per_e, codes.row_DN, 0.0)
             by_row = row_gain(pair, values, K_DN_per_e, codes.row_DN) * codes.row_DN
             expected[i] = float(np.sum(p * pair.differences_DN**2)) / (2 * float(p.sum())) - by_row**2
-    more = unexplained_variance(data, expected, data.rules.most_hits, pairs.skewed)
+    more = unexplained_variance(data, expected, data.rules.most_hits, skewed)
     if abs(more.value) > data.rules.foreign_sigma * more.variance**0.5:
         # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
         # codes tell of the rest depends on the distribution as well.

@@ -62,7 +62,6 @@ class Pattern:
     """A variance between pixels (may be negative by chance), its standard deviation, samples, and outliers left out.
 
     It is that of the pixels at hand (EMVA 1288), not of all sensors of the kind: the draw of these is no part of sigma.
-
     ``mean`` is that of the samples left in; ``places`` are (row, column) of the first outliers. ``structure2`` is a
     variance between pixels that is not white, so that it was taken for the light's; 0 where it cannot be seen.
     """
@@ -101,8 +100,8 @@ def dsnu(dark_DN: Picture, temporal: Quantity, row_DN2: float, defect_sigma: flo
     own = np.maximum(parts - [temporal.value, pixel / columns + row_DN2, pixel / rows], 0.0)
     # Each part is chi-squared with its own number of values; this sensor's own pattern is what is asked for.
     drawn = float(np.sum(2 * np.maximum(parts**2 - own**2, 0.0) / counts))
-    sigma = float(np.sqrt(drawn + temporal.variance))
-    return Pattern(total - temporal.value - row_DN2, sigma, samples, int(bad.sum()), _first_places(bad), mean)
+    variance, sigma = total - temporal.value - row_DN2, float(np.sqrt(drawn + temporal.variance))
+    return Pattern(variance, sigma, samples, int(bad.sum()), _first_places(bad), mean)
 
 
 def _first_places(bad: Mask) -> tuple[tuple[int, int], ...]:
@@ -143,8 +142,7 @@ def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, d
     rows, columns = (min(site.power.shape[axis] for site in sites) for axis in (0, 1))
     taken = (3 * rows // window + 1, 3 * columns // window + 1)
     white = white_coefficients([site.power[:rows, :columns] for site in sites], taken)
-    found = np.array([_response(site, white, temporal_DN2, shot_DN) for site in sites])
-    variances, sigmas, structures, seen = found.T
+    variances, sigmas, structures, seen = np.array([_response(of, white, temporal_DN2, shot_DN) for of in sites]).T
     weights = 1 / np.maximum(sigmas, 1e-30) ** 2
     variance, samples = float(np.average(variances, weights=weights)), len(sites) * int(np.count_nonzero(white))
     defects = np.zeros(signal_DN.shape, bool)
