@@ -132,8 +132,8 @@ def test_variance_leaves_out_hits_of_radiation() -> None:
     hit = reduced(NoiseData(data, top_code=4095), NoiseRules())
     assert clean is not None
     assert hit is not None
-    few, many = (unexplained_variance(hit, [0.0] * 6, most) for most in (1e-3, 1e-5))
-    assert few.value == pytest.approx(unexplained_variance(clean, [0.0] * 6, 1e-3).value, rel=1e-3)
+    few, many = (unexplained_variance(hit, np.zeros(6), most) for most in (1e-3, 1e-5))
+    assert few.value == pytest.approx(unexplained_variance(clean, np.zeros(6), 1e-3).value, rel=1e-3)
     assert many.value > 2 * few.value
 
 

@@ -147,16 +147,14 @@ def _dark_cdf(sigma_DN: float, shape: float, row_DN: float, dark_DN: float, K_DN
     return edges[1:], np.clip(np.maximum.accumulate(np.cumsum(mass)), 0.0, 1.0)
 
 
-def pair_probability(
-    pair: DarkPair, values: Five, K_DN_per_e: float, sigma_row_DN: float, background: float
-) -> PerCode:
+def pair_probability(pair: DarkPair, values: Five, K_DN_per_e: float, row_DN: float, background: float) -> PerCode:
     """Probability of the two codes of a pixel by groups of codes; ``background`` is NoiseRules'."""
     black, per_s, variance, spread2, shape = (float(v) for v in values)
     drift = per_s * pair.exposure_s
-    grid, cdf = _dark_cdf(np.sqrt(variance), shape, sigma_row_DN, drift, K_DN_per_e)
+    grid, cdf = _dark_cdf(np.sqrt(variance), shape, row_DN, drift, K_DN_per_e)
     # Counts of dark current widen the distribution but leave its peaks as narrow as the read noise. For a smooth
     # integrand, evenly spaced nodes are as good as any quadrature.
-    width, spread = max(np.sqrt(variance + sigma_row_DN**2), 1e-9), np.sqrt(spread2)
+    width, spread = max(np.sqrt(variance + row_DN**2), 1e-9), np.sqrt(spread2)
     z = np.linspace(-5.5, 5.5, int(np.clip(np.ceil(17.6 * spread / width), 13, 1201)) | 1)
     weights = np.exp(-0.5 * z**2)
     below = np.interp(pair.edges_DN - (black + drift + spread * z)[:, None], grid, cdf, left=0.0, right=1.0)

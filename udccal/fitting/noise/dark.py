@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -17,6 +16,9 @@ from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
 
 PerPair = Float[np.ndarray, " _"]
+# Of black and dark current.
+Two = Float[np.ndarray, "2"]
+Cov = Float[np.ndarray, "2 2"]
 
 
 @final
@@ -33,7 +35,7 @@ class DarkTerms:
     curvature: float
     black_DN: float
     dark_DN_per_s: Quantity
-    levels_cov: Float[np.ndarray, "2 2"]
+    levels_cov: Cov
     unsteady_DN: float
     read_DN2: Quantity
     shape: Quantity
@@ -46,9 +48,7 @@ class DarkTerms:
     offsets: Pattern
 
 
-def fit_dark_terms(
-    data: NoiseMoments, K_DN_per_e: float, start: Five | None = None, curvature: float = 0.0
-) -> DarkTerms:
+def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature: float = 0.0) -> DarkTerms:
     """Fit all dark quantities; only the dark current's shot noise depends on ``K_DN_per_e``.
 
     ``curvature`` is the response's in 1/DN: dark signal bends as light does.
@@ -93,11 +93,11 @@ class _Codes:
     white: bool
 
 
-def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five | None) -> _Codes:
+def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five) -> _Codes:
     """Fit the codes and the row noise by turns: each needs the other."""
     rules, unresolved = data.rules, 0.0
 
-    def fitted(row_DN: float, start: Five | None, normal: bool = False) -> DarkFit:
+    def fitted(row_DN: float, start: Five, normal: bool = False) -> DarkFit:
         return fit_dark(data.darks, K_DN_per_e, row_DN, rules, start, normal)
 
     row, row_DN = row_noise(data, np.ones(len(data.darks)))
@@ -144,9 +144,7 @@ def _with_drawn_rows(fit: DarkFit, data: NoiseMoments, row_DN: float) -> DarkFit
     return replace(fit, cov=cov)
 
 
-def _line(
-    means: PerPair, variances: PerPair, times: PerPair
-) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], PerPair]:
+def _line(means: PerPair, variances: PerPair, times: PerPair) -> tuple[Two, Cov, PerPair]:
     """Black and dark current in DN per s by a line through mean signals, their covariance, and what the line leaves.
 
     One exposure time does not tell dark current from black: all is black.
@@ -157,7 +155,7 @@ def _line(
     return values, cov, means - design @ values
 
 
-def _with_means(data: NoiseMoments, found: _Codes) -> tuple[DarkFit, Float[np.ndarray, "2"], bool]:
+def _with_means(data: NoiseMoments, found: _Codes) -> tuple[DarkFit, Two, bool]:
     """The fit with the mean signals of the dark pairs, how far mean codes would move black and dark current, and
     ``DarkTerms.skewed``.
 
@@ -184,8 +182,8 @@ def _kept_rounding(data: NoiseMoments, temporal_DN2: float) -> float:
 
 
 def _levels(
-    data: NoiseMoments, codes: _Codes, doubt: Float[np.ndarray, "2"], more: tuple[float, float] | None, curvature: float
-) -> tuple[float, Quantity, Float[np.ndarray, "2 2"], float]:
+    data: NoiseMoments, codes: _Codes, doubt: Two, more: tuple[float, float] | None, curvature: float
+) -> tuple[float, Quantity, Cov, float]:
     """Black, dark current, their covariance and ``DarkTerms.unsteady_DN``, by every dark exposure's mean and weight.
 
     ``more`` is the stack's mean, and the temporal variance of one of its frames.
@@ -228,7 +226,7 @@ def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float, skewed: bo
     fit, values, times = codes.fit, codes.fit.values, np.array([pair.exposure_s for pair in data.darks])
     read, variance = float(values[2]), float(fit.cov[2, 2])
     rate = _line(fit.means_DN, fit.variances_DN2, times)[0][1] if skewed else values[1]
-    expected = (read + data.rounding_DN2 + K_DN_per_e * np.maximum(rate * times, 0.0)).tolist()
+    expected = read + data.rounding_DN2 + K_DN_per_e * np.maximum(rate * times, 0.0)
     if not codes.white:
         # That of the fitted distribution in each pair's codes, without row noise.
         for i, pair in enumerate(data.darks):
@@ -246,9 +244,7 @@ def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float, skewed: bo
     return Quantity(read, variance), False
 
 
-def unexplained_variance(
-    data: NoiseMoments, expected_DN2: Sequence[float], most_hits: float, of_all: bool = False
-) -> Quantity:
+def unexplained_variance(data: NoiseMoments, expected_DN2: PerPair, most_hits: float, of_all: bool = False) -> Quantity:
     """Temporal variance of dark samples, without row noise, less that expected in each pair.
 
     It comes from the differences of the codes, and its sigma from their fourth moment. Differences taken for hits count
@@ -257,7 +253,7 @@ def unexplained_variance(
     from the others count only where ``of_all`` is True: hot ones have shot noise, dead ones have none.
     """
     values, variances = _temporal(data, most_hits, of_all)
-    value = float(np.average(values - np.asarray(expected_DN2), weights=1.0 / variances))
+    value = float(np.average(values - expected_DN2, weights=1.0 / variances))
     return Quantity(value, float(1.0 / (1.0 / variances).sum()))
 
 

@@ -16,13 +16,11 @@ from udccal.fitting.noise.patterns import Pattern, rough_median
 from udccal.result import Outliers
 
 
-def left_out(
-    data: NoiseMoments, dark: DarkTerms, curve: Curve, uneven: Pattern, saturation_DN: float
-) -> Iterator[Outliers]:
-    """Samples that are left out, by rule; some of these are empty."""
+def left_out(data: NoiseMoments, dark: DarkTerms, curve: Curve, uneven: Pattern, end_DN: float) -> Iterator[Outliers]:
+    """Samples that are left out, by rule; some of these are empty. ``end_DN`` is saturation."""
     names = [*(f"flat {i} ({flat.exposure_s:.4g} s)" for i, flat in enumerate(data.flats)), "flat stack"]
     # Unclipped samples stand out among clipped ones; that is no defect.
-    ceiling = saturation_DN - 0.1 * (curve.ceiling_DN - dark.black_DN)
+    ceiling = end_DN - 0.1 * (curve.ceiling_DN - dark.black_DN)
     seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
     hits, sigma = sum(moments.outliers for moments in seen), f"{data.rules.outlier_sigma:g} robust sigma"
     yield Outliers(f"two codes of a pixel {data.rules.hit_sigma:g} sigma apart in a pair (hits, blinking pixels)", hits)
@@ -45,10 +43,8 @@ def notes(
     if not (curve.full.any() or curve.pile):
         yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
     if not dark.white:
-        yield (
-            "Rounding or cut-off codes bend the dark codes: black, dark noise, row noise, dark current and DSNU come "
-            "from histograms, and hold for read noise of the model's kind (Tukey's lambda)."
-        )
+        found = "Rounding or cut-off codes bend the dark codes: black, dark noise, row noise, dark current and DSNU"
+        yield f"{found} come from histograms, and hold for read noise of the model's kind (Tukey's lambda)."
     if len({pair.exposure_s for pair in data.darks}) < 2:
         yield "Dark frames of one exposure time do not tell dark current from black: black holds both."
     if uneven.structure2 > 0:
@@ -61,10 +57,8 @@ def notes(
     if dark.foreign:
         yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
     if dark.skewed:
-        yield (
-            "Read noise or dark current has one tail, which the model's has not: black and dark current are those of "
-            "the mean code of all pixels."
-        )
+        found = "Read noise or dark current has one tail, which the model's has not"
+        yield f"{found}: black and dark current are those of the mean code of all pixels."
     if dark.unsteady_DN:
         found = f"The mean of dark frames is off black and dark current by {dark.unsteady_DN:.2g} DN"
         yield f"{found} from exposure to exposure; the sigmas of black, dark current and saturation include that."
@@ -77,19 +71,20 @@ def notes(
         if not dark.white:
             yield "PRNU1288 is what is left without that DSNU: offsets of hot pixels, which rounding hides, are in it."
     if len(missing := _missing_codes(data)):
-        yield (
-            f"{len(missing)} codes between others never occur (the first is {missing[0]}): the converter's steps are "
-            "uneven, and noise of a few codes, black and saturation are those of its codes."
+        found = f"{len(missing)} codes between others never occur (the first is {missing[0]})"
+        cause = (
+            "the converter's steps are uneven, and noise of a few codes, black and saturation are those of its codes"
         )
+        yield f"{found}: {cause}."
     if (test := curve.fit.misfit).found:
         found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
         yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
         yield "PRNU1288 holds for the photon transfer curve as fitted, which the variances do not follow."
     if shared.found:
-        found = f"{shared.along_row:.2g} along rows, {shared.along_column:.2g} along columns"
+        found = f"(correlation {shared.along_row:.2g} along rows, {shared.along_column:.2g} along columns)"
         yield (
-            f"Neighbouring pixels share their noise (correlation {found}), as where a camera filters its frames. The "
-            f"true K is about {shared.gain_factor:.3g} times the one found; all numbers in electrons change with it."
+            f"Neighbouring pixels share their noise {found}, as where a camera filters its frames. The true K is about "
+            f"{shared.gain_factor:.3g} times the one found; all numbers in electrons change with it."
         )
     if curve.fit.order.curved:
         yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."

@@ -199,10 +199,9 @@ class TransferProblem:
         misfit = chi2_test(float(np.sum(z[:bins] ** 2)), max(bins - 1.0, 1.0))
         parameters, cov = order.curved + order.offset + order.unsteady, found.with_rest(found.equations.cov())
         criterion = bic(found.equations.cost, float(parameters), samples) if found.converged else np.inf
-        numbers = found.place, cov, float(np.sqrt(own)), found.converged
-        return Attempt(
-            order.name, parameters, criterion, TransferFit(order, *numbers, variance_z, level_z, misfit, samples)
-        )
+        numbers, residuals = (found.place, cov, float(np.sqrt(own)), found.converged), (variance_z, level_z)
+        fit = TransferFit(order, *numbers, *residuals, misfit, samples)
+        return Attempt(order.name, parameters, criterion, fit)
 
 
 def _brightness(light_DN: Grid, usable: np.ndarray) -> PerLevel:
