@@ -62,7 +62,7 @@ class DarkPair:
         return np.asarray(self.centres_DN[:, None] - self.centres_DN)
 
 
-def _centres(edges_DN: Grid, step_DN: float) -> Grid:
+def _centres(edges_DN: Float[np.ndarray, " edges"], step_DN: float) -> Float[np.ndarray, " codes"]:
     """Middle of each group of codes; that of a cut-off end is extrapolated from its neighbours."""
     edges = np.clip(edges_DN, edges_DN[1] - step_DN, edges_DN[-2] + step_DN)
     return np.asarray(0.5 * (edges[1:] + edges[:-1]))
