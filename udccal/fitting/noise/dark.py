@@ -156,8 +156,7 @@ def _line(means: PerPair, variances: PerPair, times: PerPair) -> tuple[Two, Cov,
 
 
 def _with_means(data: NoiseMoments, found: _Codes) -> tuple[DarkFit, Two, bool]:
-    """The fit with the mean signals of the dark pairs, how far mean codes would move black and dark current, and
-    ``DarkTerms.skewed``.
+    """The fit with mean signals, what mean codes would change of black and dark current, and ``DarkTerms.skewed``.
 
     Means are those of the fit's distribution, unless mean codes are far off: read noise and dark current may have one
     tail. Then they are those of all pixels. Where rounding is not white, it hides the noise from frame to frame. Mean
@@ -253,8 +252,8 @@ def unexplained_variance(data: NoiseMoments, expected_DN2: PerPair, most_hits: f
     from the others count only where ``of_all`` is True: hot ones have shot noise, dead ones have none.
     """
     values, variances = _temporal(data, most_hits, of_all)
-    value = float(np.average(values - expected_DN2, weights=1.0 / variances))
-    return Quantity(value, float(1.0 / (1.0 / variances).sum()))
+    weights = 1.0 / variances
+    return Quantity(float(np.average(values - expected_DN2, weights=weights)), float(1.0 / weights.sum()))
 
 
 def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:

@@ -54,22 +54,7 @@ def notes(
     if data.period == 1 and (apart := _sites_apart(signal)) > 0:
         found = f"The light of the 2 x 2 sites of neighbouring pixels differs by {100 * apart:.2g} %"
         yield f"{found}: the frames look like a colour mosaic, and PRNU1288 is then wrong. Give bayer=True."
-    if dark.foreign:
-        yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
-    if dark.skewed:
-        found = "Read noise or dark current has one tail, which the model's has not"
-        yield f"{found}: black and dark current are those of the mean code of all pixels."
-    if dark.unsteady_DN:
-        found = f"The mean of dark frames is off black and dark current by {dark.unsteady_DN:.2g} DN"
-        yield f"{found} from exposure to exposure; the sigmas of black, dark current and saturation include that."
-    size = data.flat_stack.mean_DN.size
-    hot = max(1 - data.dark_samples / (len(data.darks) * size), dark.offsets.outliers / size)
-    if hot > data.rules.most_hot:
-        without = "DSNU is that" if dark.skewed else "black, dark current, sigma_d and DSNU are those"
-        found = f"{100 * hot:.2g} % of dark samples are far from the others (hot or dead pixels)"
-        yield f"{found}: {without} of the others."
-        if not dark.white:
-            yield "PRNU1288 is what is left without that DSNU: offsets of hot pixels, which rounding hides, are in it."
+    yield from _of_darks(data, dark)
     if len(missing := _missing_codes(data)):
         found = f"{len(missing)} codes between others never occur (the first is {missing[0]})"
         cause = (
@@ -96,6 +81,26 @@ def notes(
             yield "The flat stack is brighter than that: PRNU1288 holds for a curve that goes on."
     if curve.fit.order.unsteady:
         yield f"The light differs by {100 * curve.fit.scatter:.2g} % from level to level."
+
+
+def _of_darks(data: NoiseMoments, dark: DarkTerms) -> Iterator[str]:
+    """Sentences on noise and pixels that the model does not describe."""
+    if dark.foreign:
+        yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
+    if dark.skewed:
+        found = "Read noise or dark current has one tail, which the model's has not"
+        yield f"{found}: black and dark current are those of the mean code of all pixels."
+    if dark.unsteady_DN:
+        found = f"The mean of dark frames is off black and dark current by {dark.unsteady_DN:.2g} DN"
+        yield f"{found} from exposure to exposure; the sigmas of black, dark current and saturation include that."
+    size = data.flat_stack.mean_DN.size
+    hot = max(1 - data.dark_samples / (len(data.darks) * size), dark.offsets.outliers / size)
+    if hot > data.rules.most_hot:
+        without = "DSNU is that" if dark.skewed else "black, dark current, sigma_d and DSNU are those"
+        found = f"{100 * hot:.2g} % of dark samples are far from the others (hot or dead pixels)"
+        yield f"{found}: {without} of the others."
+        if not dark.white:
+            yield "PRNU1288 is what is left without that DSNU: offsets of hot pixels, which rounding hides, are in it."
 
 
 def _missing_codes(data: NoiseMoments) -> Int[np.ndarray, " missing"]:

@@ -247,10 +247,11 @@ def _light(count: Grid, total: Grid) -> Mask:
     """Blocks with a ``total`` power, of ``count`` coefficients, 5 sigma above the floor, alone or in a rectangle."""
     light, floor = np.zeros(count.shape, bool), _floor(count, total)
     # Small rectangles first: light in few blocks must not make large ones of it.
-    sides = [side for side in product((1, 4, 16), repeat=2) if side[0] <= len(count) and side[1] <= count.shape[1]]
+    sides = sorted(product((1, 4, 16), repeat=2), key=lambda side: side[0] * side[1])
+    sides = [side for side in sides if side[0] <= len(count) and side[1] <= count.shape[1]]
     for _ in range(8):
         before = light.copy()
-        for down, across in sorted(sides, key=lambda side: side[0] * side[1]):
+        for down, across in sides:
             # Rectangles that begin at each block; those beyond the end are cut there.
             number, power = (
                 cv2.boxFilter(np.where(light, 0.0, part), -1, (across, down), anchor=(0, 0), normalize=False,
