@@ -53,10 +53,8 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature
 
     ``curvature`` is the response's in 1/DN: dark signal bends as light does.
     """
-    codes, stack = _fit_codes(data, K_DN_per_e, start), data.dark_stack
-    fit, doubt, skewed = _with_means(data, codes)
-    codes = replace(codes, fit=fit)
-    read, foreign = _read_noise(data, codes, K_DN_per_e, skewed)
+    codes, stack = _with_means(data, _fit_codes(data, K_DN_per_e, start)), data.dark_stack
+    fit, (read, foreign) = codes.fit, _read_noise(data, codes, K_DN_per_e)
     # Of one frame of the stack.
     shot = K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s
     single = Quantity(read.value + shot + data.rounding_DN2, read.variance)
@@ -70,11 +68,11 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature
         sigma, pixels = float(np.hypot(fit.cov[3, 3] ** 0.5, codes.unresolved_DN2)), stack.mean_DN.size
         offsets = replace(offsets, variance=float(fit.values[3]), sigma=sigma, samples=pixels)
     # The stack's mean is without hot pixels.
-    more = (offsets.mean, single.value) if fit.follows and not skewed else None
-    levels = _levels(data, codes, doubt, more, curvature)
+    more = (offsets.mean, single.value) if fit.follows and not codes.skewed else None
+    levels = _levels(data, codes, more, curvature)
     spread = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
     shape = Quantity(float(fit.values[4]), float(fit.cov[4, 4]))
-    noise, flags = (read, shape, codes.row, spread), (codes.white, foreign, skewed)
+    noise, flags = (read, shape, codes.row, spread), (codes.white, foreign, codes.skewed)
     return DarkTerms(K_DN_per_e, curvature, *levels, *noise, *flags, fit, offsets)
 
 
@@ -83,7 +81,8 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature
 class _Codes:
     """The fit of the dark codes, and the row noise that agrees with it: ``row_DN`` is that of the pairs alone.
 
-    ``unresolved_DN2`` is the row noise that rounding may hide; ``white`` as in ``DarkTerms``.
+    ``unresolved_DN2`` is the row noise that rounding may hide; ``white`` and ``skewed`` as in ``DarkTerms``. Mean codes
+    would change black and dark current by ``doubt``.
     """
 
     fit: DarkFit
@@ -91,6 +90,8 @@ class _Codes:
     row_DN: float
     unresolved_DN2: float
     white: bool
+    doubt: Two
+    skewed: bool = False
 
 
 def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five) -> _Codes:
@@ -123,7 +124,7 @@ def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five) -> _Codes:
         # Coarse codes hardly show the distribution, and all that they tell but its shape depends on it.
         fit = fit.doubted(np.append(fitted(row_DN, fit.values, True).values[:4], fit.values[4]))
         fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
-    return _Codes(fit, row, row_DN, unresolved, white)
+    return _Codes(fit, row, row_DN, unresolved, white, np.zeros(2))
 
 
 def _with_drawn_rows(fit: DarkFit, data: NoiseMoments, row_DN: float) -> DarkFit:
@@ -155,8 +156,8 @@ def _line(means: PerPair, variances: PerPair, times: PerPair) -> tuple[Two, Cov,
     return values, cov, means - design @ values
 
 
-def _with_means(data: NoiseMoments, found: _Codes) -> tuple[DarkFit, Two, bool]:
-    """The fit with mean signals, what mean codes would change of black and dark current, and ``DarkTerms.skewed``.
+def _with_means(data: NoiseMoments, found: _Codes) -> _Codes:
+    """The fit with the mean signals of the pairs, and what mean codes say of them.
 
     Means are those of the fit's distribution, unless mean codes are far off: read noise and dark current may have one
     tail. Then they are those of all pixels. Where rounding is not white, it hides the noise from frame to frame. Mean
@@ -164,15 +165,16 @@ def _with_means(data: NoiseMoments, found: _Codes) -> tuple[DarkFit, Two, bool]:
     """
     fit, dark = found.fit, data.dark_moments
     if not fit.follows:
-        return fit, np.zeros(2), False
+        return found
     times, codes = np.array([(pair.exposure_s, pair.mean_DN) for pair in data.darks]).T
     own = np.array([of.temporal_DN2 / (2 * of.pixels) + found.row_DN**2 / (2 * of.height) for of in dark])
     by_codes, cov, _ = _line(codes, own if found.white else fit.variances_DN2, times)
     doubt = by_codes - _line(fit.means_DN, fit.variances_DN2, times)[0]
     if not found.white or np.all(np.abs(doubt) <= data.rules.foreign_sigma * np.sqrt(np.diag(cov))):
-        return fit, doubt, False
+        return replace(found, doubt=doubt)
     own += [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
-    return replace(fit, means_DN=np.array([of.level_DN for of in dark]), variances_DN2=own), np.zeros(2), True
+    fit = replace(fit, means_DN=np.array([of.level_DN for of in dark]), variances_DN2=own)
+    return replace(found, fit=fit, skewed=True)
 
 
 def _kept_rounding(data: NoiseMoments, temporal_DN2: float) -> float:
@@ -181,7 +183,7 @@ def _kept_rounding(data: NoiseMoments, temporal_DN2: float) -> float:
 
 
 def _levels(
-    data: NoiseMoments, codes: _Codes, doubt: Two, more: tuple[float, float] | None, curvature: float
+    data: NoiseMoments, codes: _Codes, more: tuple[float, float] | None, curvature: float
 ) -> tuple[float, Quantity, Cov, float]:
     """Black, dark current, their covariance and ``DarkTerms.unsteady_DN``, by every dark exposure's mean and weight.
 
@@ -202,7 +204,7 @@ def _levels(
         # A few exposures tell the scatter of black only roughly (Student's t).
         unsteady *= (dof / max(dof - 2, 1)) ** 0.5
         (black, rate), cov, _ = _line(means, variances + unsteady**2, times)
-    cov = cov + np.outer(doubt, doubt)
+    cov = cov + np.outer(codes.doubt, codes.doubt)
     # Rounding of pixels without noise is the same in every frame.
     cov[0, 0] += _kept_rounding(data, float(fit.values[2])) / stack.mean_DN.size
     # All of black may be dark current.
@@ -220,11 +222,11 @@ def _levels(
     return float(black), current, cov, unsteady
 
 
-def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float, skewed: bool) -> tuple[Quantity, bool]:
+def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float) -> tuple[Quantity, bool]:
     """The read noise's variance, and ``DarkTerms.foreign``."""
     fit, values, times = codes.fit, codes.fit.values, np.array([pair.exposure_s for pair in data.darks])
     read, variance = float(values[2]), float(fit.cov[2, 2])
-    rate = _line(fit.means_DN, fit.variances_DN2, times)[0][1] if skewed else values[1]
+    rate = _line(fit.means_DN, fit.variances_DN2, times)[0][1] if codes.skewed else values[1]
     expected = read + data.rounding_DN2 + K_DN_per_e * np.maximum(rate * times, 0.0)
     if not codes.white:
         # That of the fitted distribution in each pair's codes, without row noise.
@@ -232,7 +234,7 @@ def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float, skewed: bo
             p = pair_probability(pair, values, K_DN_per_e, codes.row_DN, 0.0)
             by_row = row_gain(pair, values, K_DN_per_e, codes.row_DN) * codes.row_DN
             expected[i] = float(np.sum(p * pair.differences_DN**2)) / (2 * float(p.sum())) - by_row**2
-    more = unexplained_variance(data, expected, data.rules.most_hits, skewed)
+    more = unexplained_variance(data, expected, data.rules.most_hits, codes.skewed)
     if abs(more.value) > data.rules.foreign_sigma * more.variance**0.5:
         # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
         # codes tell of the rest depends on the distribution as well.
