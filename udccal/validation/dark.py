@@ -59,8 +59,7 @@ def _left(columns: Float[np.ndarray, "n k"], values: Float[np.ndarray, " n"]) ->
 
 def _frame_means(one: Moments) -> Float[np.ndarray, " frames"]:
     """Mean of each frame in DN."""
-    weights = one.samples
-    return np.asarray(np.average(one.mean_DN, weights=weights) + np.average(one.shift_DN, axis=1, weights=weights))
+    return np.asarray(one.level_DN + np.average(one.shift_DN, axis=1, weights=one.samples))
 
 
 def dark_pattern_check(seen: NoiseMoments, term: Noise, limits: ValidationLimits) -> Check:

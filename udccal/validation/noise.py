@@ -185,7 +185,7 @@ def _inside(flats: tuple[Moments, ...], term: Noise) -> Bool[np.ndarray, "flats 
 def dark_line(seen: NoiseMoments) -> tuple[float, float, float]:
     """Return the dark frames' mean at no exposure in DN, its change in DN/s, and the longest exposure in s."""
     exposure = np.array([one.exposure_s for one in seen.dark_moments])
-    mean = np.array([np.average(one.mean_DN, weights=one.samples) for one in seen.dark_moments])
+    mean = np.array([one.level_DN for one in seen.dark_moments])
     slope, start = np.polyfit(exposure, mean, 1) if np.ptp(exposure) > 0 else (0.0, mean.mean())
     return float(start), float(slope), float(exposure.max())
 

@@ -166,12 +166,12 @@ def pair_probability(pair: DarkPair, values: Five, K_DN_per_e: float, row_DN: fl
 def _mean_codes(pair: DarkPair, values: Five, K_DN_per_e: float, spread_DN: float, shifts_DN: Grid) -> Grid:
     """Mean codes of samples whose signals are shifted, with offsets and row noise of normal ``spread_DN``."""
     black, per_s, variance, _, shape = (float(v) for v in values)
-    mean, edges, step = black + per_s * pair.exposure_s, pair.edges_DN, pair.step_DN
+    drift, edges, step = per_s * pair.exposure_s, pair.edges_DN, pair.step_DN
     # Of single codes, offsets widen the distribution as normal noise does.
-    grid, cdf = _dark_cdf(float(np.sqrt(variance)), shape, spread_DN, mean - black, K_DN_per_e)
+    grid, cdf = _dark_cdf(float(np.sqrt(variance)), shape, spread_DN, drift, K_DN_per_e)
     # A window of codes cuts off tails, and may be narrower than offsets that grow with the exposure: groups are added
     # where no code is cut off, which is so where none lies at the end.
-    reach = float(np.interp(1 - 1e-6, cdf, grid)) + float(np.abs(shifts_DN).max())
+    mean, reach = black + drift, float(np.interp(1 - 1e-6, cdf, grid)) + float(np.abs(shifts_DN).max())
     below, above = (max(int(np.ceil((off + reach) / step)), 1) for off in (edges[1] - mean, mean - edges[-2]))
     whole = np.isfinite(edges[[0, -1]]) | (pair.counts.sum(axis=1)[[0, -1]] == 0)
     first = edges[1] - step * np.arange(below, 0, -1) if whole[0] else edges[:1]
@@ -190,8 +190,8 @@ def row_gain(pair: DarkPair, values: Five, K_DN_per_e: float, sigma_row_DN: floa
     z = np.linspace(-4.0, 4.0, 33)
     shift, weights = max(sigma_row_DN, 0.01 * float(np.sqrt(values[2]))) * z, np.exp(-0.5 * z**2)
     means = _mean_codes(pair, values, K_DN_per_e, float(np.sqrt(values[3])), shift)
-    both = np.cov(means, shift, aweights=weights, ddof=0)
-    return float(np.sqrt(both[0, 0] / both[1, 1]))
+    scatter, own = (float(np.cov(of, aweights=weights, ddof=0)) for of in (means, shift))
+    return float(np.sqrt(scatter / own))
 
 
 @final
