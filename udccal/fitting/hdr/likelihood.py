@@ -57,23 +57,32 @@ _LEAST_DARK: Final = -0.01
 @final
 @dataclass(frozen=True)
 class HdrRules:
-    """The constants of a merge; the comments say what each is."""
+    """The constants of a merge.
 
-    # A sample farther than this from the other samples of its pixel is a hit, clipped or not.
+    Attributes:
+        believed_sigma: a sample farther than this from the other samples of its pixel is a hit, clipped or not.
+        margin_sigma: samples count as clipped from this many sigma of dark noise below saturation on.
+        frame_off, frame_sigma: a frame is left out when its light is off by more than both (relative, and in sigma).
+        least_to_judge: the fewest samples of a pixel for finding hits and testing frames.
+        scatter_off: scatter of samples about their light, relative to the noise model's variance, that is too much.
+        sure_electrons: electrons that a pixel's light is worth before the scatter about it is judged.
+        black_off: error of the black level, in sigma of dark noise, that is too much.
+        bend_off: part of the signal at saturation, missing against shorter exposures, that is too much.
+        light_off: light of a frame that is off, in sigma of a full pixel, of which a note tells.
+        least_codes: codes above black from which neighbouring samples are rounded up as often as down: their light
+            differs by parts of a code, and its own noise smears the steps.
+    """
+
     believed_sigma: float = 6.0
-    # Samples count as clipped from this many sigma of dark noise below saturation on.
     margin_sigma: float = 6.0
-    # A frame is left out when its light is off by more than both (relative, and in sigma).
     frame_off: float = 0.02
     frame_sigma: float = 5.0
-    least_to_judge: int = 3  # the fewest samples of a pixel for finding hits and testing frames
-    scatter_off: float = 0.05  # of the samples' variance about their light against the noise model's: too much
-    sure_electrons: float = 100.0  # that a pixel's light is worth before the scatter about it is judged
-    black_off: float = 0.1  # error of the black level, in sigma of dark noise, that is too much
-    bend_off: float = 0.01  # part of the signal at saturation, missing against shorter exposures, that is too much
-    light_off: float = 0.25  # light of a frame that is off, in sigma of a full pixel, of which a note tells
-    # Codes above black from which neighbouring samples are rounded up as often as down: their light differs by parts
-    # of a code, and its own noise smears the steps.
+    least_to_judge: int = 3
+    scatter_off: float = 0.05
+    sure_electrons: float = 100.0
+    black_off: float = 0.1
+    bend_off: float = 0.01
+    light_off: float = 0.25
     least_codes: float = 2.0
 
 

@@ -24,45 +24,62 @@ SOLVER = SolverRules(least_gain=1e-2, stalled_gain=0.1)
 @final
 @dataclass(frozen=True)
 class WireRules:
-    """The constants of a wire fit; the comments say what each is."""
+    """The constants of a wire fit.
 
-    samples: int = 300_000  # pixels of the joint fit; time grows with it, the map's sigma falls with its square root
-    # Parts of ``samples`` for the search of the shape and for its first full fit, and the harmonics of the search.
+    Attributes:
+        samples: pixels of the joint fit; time grows with it, the map's sigma falls with its square root.
+        search_part, shape_part: parts of ``samples`` for the search of the shape and for its first full fit.
+        search_harmonics: number of the strongest harmonics, which are enough for the search.
+        least_samples: fewest pixels of a flat.
+        most_clipped: part of the flat's pixels that may be clipped.
+        headroom_sigma: distance of single frames from saturation; with less, their average is not linear.
+        rotation_sigma_rad: prior sigma of the rotation about the geometry's own.
+        widening: the prior's sigma in units of the rig's tolerances, which are bounds of a careful build.
+        amplitude_sigma, field_sigma: prior sigma of free amplitudes, and of relative changes of the pupil's transform.
+        least_amplitude: relative size from which harmonics are fitted; the others are part of the map's sigma.
+        least_counted: relative size from which the others count there.
+        strong: relative sizes from which a harmonic may have many or few corrections to the round pupil.
+        smooth_degrees: of the shading: those up to the first are always fitted, those up to the second if supported.
+        scan_range: of stand-off and of pupil, relative to the rig description: a quotient of lengths, each 20 % off.
+        scan_steps: of the stand-off in periods at the edge of the field, and of the pupil in radians of z, the
+            argument of its transform.
+        places: most places of the scan from which descents start.
+        sharpness: of the openings' edges, to try; see ``with_harmonics``.
+        rival: difference in minus twice the log posterior below which places may change their order with more pixels.
+        unfinished: the same difference after the first steps.
+        doubtful_variance: residual variance beyond which free amplitudes, which no pupil explains, are tried.
+        free: number of harmonics with free amplitudes, and their degree over the sensor.
+        least_gain: chi-squared that rows must explain; chance does not reach a third of it in 300 trials.
+        worst_variance: residual variance beyond which the fit is poor: model error as strong as shot noise and PRNU.
+        doubted_sigma: deviation in prior sigmas beyond which the rig description is doubted.
+    """
+
+    samples: int = 300_000
     search_part: float = 1 / 15
     shape_part: float = 1 / 6
     search_harmonics: int = 24
-    least_samples: int = 4000  # fewest pixels of a flat
-    most_clipped: float = 0.05  # part of the flat's pixels that may be clipped
-    headroom_sigma: float = 5.0  # distance of single frames from saturation; with less, their average is not linear
-    rotation_sigma_rad: float = 0.04  # prior sigma of the rotation about the geometry's own
-    widening: float = 2.0  # the prior's sigma in units of the rig's tolerances, which are bounds of a careful build
-    # Prior sigma of free amplitudes, and of relative changes of the pupil's transform.
+    least_samples: int = 4000
+    most_clipped: float = 0.05
+    headroom_sigma: float = 5.0
+    rotation_sigma_rad: float = 0.04
+    widening: float = 2.0
     amplitude_sigma: float = 0.05
     field_sigma: float = 0.5
-    # Relative size from which harmonics are fitted, and from which the others count in the map's sigma.
     least_amplitude: float = 3e-5
     least_counted: float = 1e-6
-    # Relative sizes from which a harmonic may have many or few corrections to the round pupil.
     strong: tuple[float, float] = (2e-3, 2e-4)
-    # Of the shading: degrees up to the first are always fitted, those up to the second if supported.
     smooth_degrees: tuple[int, int] = (4, 8)
-    # Of stand-off and of pupil, relative to the rig description: a quotient of lengths, each 20 % off.
     scan_range: tuple[float, float] = (0.64, 1.56)
-    # Of the stand-off in periods at the edge of the field, and of the pupil in radians of z, its transform's argument.
     scan_steps: tuple[float, float] = (0.06, 0.8)
-    places: int = 5  # most places of the scan from which descents start
-    sharpness: tuple[float, ...] = (1.0, 0.5, 0.0)  # of the openings' edges, to try; see ``with_harmonics``
-    # Difference in minus twice the log posterior below which places may change their order with more pixels, and
-    # below which they may after the first steps.
+    places: int = 5
+    sharpness: tuple[float, ...] = (1.0, 0.5, 0.0)
     rival: float = 60.0
     unfinished: float = 400.0
-    # Residual variance beyond which free amplitudes, which no pupil explains, are tried: of so many harmonics, and of
-    # so many degrees over the sensor.
     doubtful_variance: float = 1.15
     free: tuple[int, int] = (3, 3)
-    least_gain: float = 100.0  # chi-squared that rows must explain; chance does not reach a third of it in 300 trials
-    worst_variance: float = 2.0  # beyond it the fit is poor: model error is as strong as shot noise and PRNU
-    doubted_sigma: float = 3.0  # deviation in prior sigmas beyond which the rig description is doubted
+    least_gain: float = 100.0
+    worst_variance: float = 2.0
+    doubted_sigma: float = 3.0
 
 
 @final
