@@ -74,7 +74,7 @@ def calibrate_views(
         found = f"{len(given.names) + len(gathered.notes)} views, {len(given.names)} of them usable"
         raise FitError(
             f"Expected at least {least} views of at least {rules.least_corners} points each, found {found}. "
-            f"{' '.join(gathered.notes)} Capture more views of the board."
+            + " ".join([*gathered.notes, "Capture more views of the board."])
         )
     robust, given, strange = _distinct(
         given, least, lambda points: _Search(points, known).best_of(starts(points, image_size, start, start_poses))
