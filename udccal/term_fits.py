@@ -21,7 +21,7 @@ from udccal.fitting.noise.data import read_noise
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, lacking, nominal_geometry
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.read import read_psf
+from udccal.fitting.psf.start import read_psf
 from udccal.fitting.wire.data import read_wire
 from udccal.fitting.wire.fit import fit_wire, sensor_map
 from udccal.fitting.wire.parameters import WireRules

@@ -35,7 +35,7 @@ from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.read import read_backscatter, sampled_rays
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.read import read_psf
+from udccal.fitting.psf.start import read_psf
 from udccal.models.geometry import project_directions
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import wire_values

@@ -18,8 +18,8 @@ from udccal.arrangements import Led
 from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.diffraction import fit_diffraction
-from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice, start_model, start_prior
-from udccal.fitting.psf.samples import some_shots
+from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice
+from udccal.fitting.psf.start import some_shots, start_model, start_prior
 from udccal.numerics import in_float64
 from udccal.planning.psf import PsfPredictor
 from udccal.planning.state import RigState

@@ -19,7 +19,7 @@ from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.geometry.fit import term_at
 from udccal.fitting.psf.data import PsfData, PsfRules
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.kernel import pack, start_model
+from udccal.fitting.psf.start import pack, start_model
 from udccal.models.geometry import unproject
 from udccal.mounting import angles_deg
 from udccal.numerics import in_float64

@@ -14,7 +14,7 @@ from udccal.fitting.hdr.merge import merge_bracket
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.data import Shots, joined
 from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice
-from udccal.fitting.psf.read import cut_crop
+from udccal.fitting.psf.start import cut_crop
 from udccal.models.diffraction import Diffraction, average_transfer, local_frame
 from udccal.models.geometry import Geometry
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables

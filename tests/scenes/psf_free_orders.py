@@ -13,7 +13,7 @@ from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import PsfRules, Shots, joined
 from udccal.fitting.psf.image import Sources
 from udccal.fitting.psf.orders import select_field
-from udccal.fitting.psf.read import cut_crop
+from udccal.fitting.psf.start import cut_crop
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.numerics import in_float64
 

@@ -12,8 +12,8 @@ from tests.scenes.psf import DISC_PX, Picture, Scene, pictures, shots_of, small_
 from udccal.cfa import cfa_named
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.image import Sources, prior_sigma, shifts
-from udccal.fitting.psf.kernel import start_model, start_prior
 from udccal.fitting.psf.orders import select_field
+from udccal.fitting.psf.start import start_model, start_prior
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.numerics import in_float64
 

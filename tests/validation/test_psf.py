@@ -12,7 +12,7 @@ from tests.scenes.psf import pictures, shots_of, small_scene
 from tests.validation.judged import failed, named
 from udccal.fitting.psf.data import PsfData
 from udccal.fitting.psf.fit import nominal_psf
-from udccal.fitting.psf.kernel import pack
+from udccal.fitting.psf.start import pack
 from udccal.models.psf import PsfField
 from udccal.result import Diagnostic, FitResult
 from udccal.validation.limits import ValidationLimits

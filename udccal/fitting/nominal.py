@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from udccal.fitting.backscatter.parameters import BackscatterRules
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.psf.data import PsfRules, group
-from udccal.fitting.psf.kernel import start_model
+from udccal.fitting.psf.start import start_model
 from udccal.fitting.wire.parameters import ideal_wire, wire_start
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry

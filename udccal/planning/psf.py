@@ -19,9 +19,9 @@ from udccal.arrangements import Led
 from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.psf.data import PsfRules, Shots, held_out_positions
-from udccal.fitting.psf.kernel import Evaluator, fit_lattice, start_model, start_prior
+from udccal.fitting.psf.kernel import Evaluator, Samples, fit_lattice, gather
 from udccal.fitting.psf.problem import DiffractionProblem
-from udccal.fitting.psf.samples import Samples, choose_samples, gather, stands_for, weighed
+from udccal.fitting.psf.start import choose_samples, stands_for, start_model, start_prior
 from udccal.fitting.wire.parameters import ideal_wire, possible_harmonics, wire_start
 from udccal.numerics import in_float64
 from udccal.planning.design import DESIGN_VARIABLES, Limits
@@ -107,7 +107,7 @@ class PsfPredictor:
             counts = full_e * light < state.full_well_e
             known += np.where(counts, full_e**2 / state.variance_e(full_e * light, exposure_s), 0.0)
         known *= (samples.known > 0) / (1 + known * (state.noise.PRNU1288 * light) ** 2)
-        merged = replace(self._problem, samples=weighed(replace(samples, known=known), state.model_errors.psf))
+        merged = replace(self._problem, samples=replace(samples, known=known).weighed(state.model_errors.psf))
         by_place = [one.marginal()[0] for one in merged.by_position(self._place)[len(_FIELD) :]]
         return np.mean(by_place, axis=0) / len(_SHIFTS_PX)
 

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udccal.fitting.psf.data import HUBER, PsfData, PsfRules, Shots, held_out_positions
+from udccal.fitting.psf.held_out import Compared, compare
 from udccal.fitting.psf.image import make_windows
-from udccal.fitting.psf.kernel import Evaluator, fit_lattice, pack
-from udccal.fitting.psf.orders import Compared, compare
+from udccal.fitting.psf.kernel import Evaluator, fit_lattice
 from udccal.fitting.psf.problem import explain
-from udccal.fitting.psf.read import read_psf
+from udccal.fitting.psf.start import pack, read_psf
 from udccal.models.fields import polynomial_basis
 from udccal.models.psf import PsfField
 from udccal.numerics import in_float64
@@ -129,7 +129,7 @@ def _compared(term: PsfField, shots: Shots, model_error: float, rules: PsfRules)
     unit = (shots.positions_px() - np.asarray(term.centre_px)) / np.asarray(term.half_px)
     basis = np.asarray(polynomial_basis(unit, term.degree), dtype=np.float64)[shots.position]
     windows = make_windows(shots, sources, explained, basis, model_error)
-    light = windows.expected(False, _framed(np.asarray(term.residual, dtype=np.float64), shots.rate.shape[1:]))
+    light = windows.expected(_framed(np.asarray(term.residual, dtype=np.float64), shots.rate.shape[1:]))
     return compare(shots, windows, light)
 
 

@@ -20,9 +20,9 @@ from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import Prior, cramer_rao, scaled_inverse
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import fit_diffraction
-from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice, start_model, start_prior
+from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, Samples, fit_lattice, gather
 from udccal.fitting.psf.problem import DiffractionProblem, kernel_of
-from udccal.fitting.psf.samples import Samples, choose_samples, gather, sensor_variance, unit_light
+from udccal.fitting.psf.start import choose_samples, start_model, start_prior
 from udccal.numerics import in_float64
 from udccal.rig import load_rig
 
@@ -143,8 +143,8 @@ def _information(
     for position, kernel in enumerate(kernels):
         one = problem.samples.at(position)
         flux = np.stack([made[i].flux for i in one.index])
-        by_global, by_local, light = _slopes(evaluator, theta, one, np.asarray(kernel), flux)
-        weight = 1.0 / sensor_variance(one, light)
+        by_global, by_local, light = _slopes(evaluator, theta, one, kernel, flux)
+        weight = 1.0 / one.sensor_variance(light)
         own = np.einsum("snk,sn,snl->skl", by_local, weight, by_local)
         cross = np.einsum("snp,sn,snl->psl", by_global, weight, by_local)
         both = np.einsum("snp,sn,snq->pq", by_global, weight, by_global)
@@ -171,7 +171,7 @@ def _slopes(
     own = np.einsum("snc,snc->sn", unit.reshape(*shape, 3), colour)
     by_global = np.einsum("psnc,snc,sn->snp", by_theta.reshape(-1, *shape, 3), colour, light)
     moves = [
-        np.asarray(unit_light(evaluator, one, np.zeros((shape[0], 2)) + move, kernel))
+        one.unit_light(kernel, np.zeros((shape[0], 2)) + move)
         for move in _MOVE_PX * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     ]
     by_move = np.stack([moves[0] - moves[1], moves[2] - moves[3]], axis=-1) / (2 * _MOVE_PX)

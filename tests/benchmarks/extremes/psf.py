@@ -20,7 +20,8 @@ from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfData, PsfRules
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice, start_model, start_prior
+from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice
+from udccal.fitting.psf.start import start_model, start_prior
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.numerics import in_float64
 from udccal.result import FitResult

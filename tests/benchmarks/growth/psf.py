@@ -10,7 +10,7 @@ from tests.benchmarks.growth.cases import Case
 from tests.scenes.psf import pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.diffraction import fit_diffraction
-from udccal.fitting.psf.kernel import start_model, start_prior
+from udccal.fitting.psf.start import start_model, start_prior
 from udccal.numerics import in_float64
 
 _ITERATIONS = 4

@@ -13,8 +13,7 @@ from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction
-from udccal.fitting.psf.kernel import start_model, start_prior
-from udccal.fitting.psf.samples import some_shots
+from udccal.fitting.psf.start import some_shots, start_model, start_prior
 from udccal.numerics import in_float64
 
 

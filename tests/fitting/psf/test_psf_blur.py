@@ -11,7 +11,8 @@ import pytest
 from tests.scenes.psf import pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.diffraction import fit_diffraction
-from udccal.fitting.psf.kernel import BLUR, BLUR_BLUE, BLUR_RED, GROWTH, start_model, start_prior
+from udccal.fitting.psf.kernel import BLUR, BLUR_BLUE, BLUR_RED, GROWTH
+from udccal.fitting.psf.start import start_model, start_prior
 from udccal.models.diffraction import Diffraction, blur_variance, local_frame
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64

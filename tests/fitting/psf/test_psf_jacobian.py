@@ -10,22 +10,9 @@ from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.kernel import (
-    HEAD,
-    PITCH,
-    PUPIL,
-    WAVELENGTHS_NM,
-    Evaluator,
-    fit_lattice,
-    kernel_coefficients,
-    kernel_jacobian,
-    overlaps_of,
-    start_model,
-    start_prior,
-    wavelengths_nm,
-)
+from udccal.fitting.psf.kernel import HEAD, PITCH, PUPIL, WAVELENGTHS_NM, Evaluator, fit_lattice, gather
 from udccal.fitting.psf.problem import DiffractionProblem, stepped
-from udccal.fitting.psf.samples import gather, unit_light
+from udccal.fitting.psf.start import start_model, start_prior, wavelengths_nm
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
@@ -67,14 +54,13 @@ def test_slopes_of_the_kernel_are_those_of_differences(
 def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> tuple[np.ndarray, np.ndarray]:
     problem = problem_of(scene, prior, shots, interference)
     one, theta, evaluator = problem.samples.at(0), prior.mean, problem.evaluator
-    made, chain = (np.asarray(p) for p in kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps))
+    made, chain = (np.asarray(p) for p in evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps))
     by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
     found = np.einsum("yxfc,fcp->pyxc", by_factor, chain)
     wanted = []
     for step in np.eye(HEAD, theta.size) * _STEPS[:, None]:
         more, less = (
-            np.asarray(kernel_coefficients(evaluator, theta + sign * step, one.frame, one.disc_px, one.overlaps))
-            for sign in (1, -1)
+            np.asarray(evaluator.kernel(theta + sign * step, one.frame, one.disc_px, one.overlaps)) for sign in (1, -1)
         )
         wanted.append((more - less) / (2 * step.sum()))
     return found, np.stack(wanted)
@@ -108,9 +94,9 @@ def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray
             other = theta.copy()
             other[number] += move
             # The kernel of the same numbers: what changes is the overlaps.
-            overlaps = overlaps_of(problem.evaluator, other, one.frame)
-            kernel = np.asarray(kernel_coefficients(problem.evaluator, theta, one.frame, one.disc_px, overlaps))
-            lit.append(np.asarray(unit_light(problem.evaluator, one, own[0, :, :2], kernel)))
+            overlaps = problem.evaluator.overlaps(other, one.frame)
+            kernel = np.asarray(problem.evaluator.kernel(theta, one.frame, one.disc_px, overlaps))
+            lit.append(one.unit_light(kernel, own[0, :, :2]))
         wanted.append((lit[0] - lit[1]) / (2 * step_mm))
     return np.moveaxis(np.asarray(one.by_overlaps), -1, 0), np.stack(wanted)
 

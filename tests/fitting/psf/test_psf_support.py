@@ -13,20 +13,20 @@ from hypothesis import given
 
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
 from udccal.cfa import cfa_named
+from udccal.fitting.engine.orders import Attempt, choose
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import absent_wire, nominal_geometry
 from udccal.fitting.psf.fit import nominal_psf
 from udccal.fitting.psf.held_out import (
+    Compared,
     Support,
     choose_support,
-    support_notes,
     wide_support,
     windows_to_try,
     with_support,
 )
 from udccal.fitting.psf.image import Sources
-from udccal.fitting.psf.orders import Compared
-from udccal.fitting.psf.read import read_psf
+from udccal.fitting.psf.start import read_psf
 from udccal.kernels import fitted_size, kernel_size, kernels_at
 from udccal.models.psf import PsfField
 from udccal.rig import load_rig
@@ -38,6 +38,12 @@ from udccal.sessions.writer import SessionWriter
 HALF = (64, 16)
 SHOTS = 6
 ROWS, COLUMNS = windows_to_try(HALF[0]), windows_to_try(HALF[1])
+
+
+def half_px(support: Support) -> tuple[int, int]:
+    """(Rows, columns) to either side of the source."""
+    down, across = support
+    return down.best.fit, across.best.fit
 
 
 def cross() -> np.ndarray:
@@ -63,7 +69,7 @@ def test_the_right_window_is_chosen_in_95_of_100_runs() -> None:
     right = 0
     for _ in range(100):
         true = (int(rng.choice(ROWS)), int(rng.choice(COLUMNS)))
-        right += choose_support(compared_of(true, rng)).half_px == true
+        right += half_px(choose_support(compared_of(true, rng))) == true
     assert right >= 95
 
 
@@ -76,26 +82,26 @@ def test_windows_rise_to_the_largest(largest: int) -> None:
 
 def test_light_up_to_the_border_has_no_end() -> None:
     found = choose_support(compared_of(HALF, np.random.default_rng(1)))
-    assert found.open_ended == (True, True)
+    assert half_px(found) == HALF
     found = choose_support(compared_of((HALF[0], 8), np.random.default_rng(1)))
-    assert found.open_ended == (True, False)
+    assert half_px(found) == (HALF[0], 8)
 
 
 def test_an_even_background_is_no_light_of_the_kernel() -> None:
-    assert choose_support(compared_of((16, 8), np.random.default_rng(2), background=3e-3)).half_px == (16, 8)
+    assert half_px(choose_support(compared_of((16, 8), np.random.default_rng(2), background=3e-3))) == (16, 8)
 
 
 def test_hits_are_no_light_of_the_kernel() -> None:
     compared = compared_of((16, 8), np.random.default_rng(3))
     compared.residual[:, 5::40, ::7] += 0.3
-    assert choose_support(compared).half_px == (16, 8)
+    assert half_px(choose_support(compared)) == (16, 8)
 
 
 def test_no_light_and_no_sample_is_the_narrowest_window() -> None:
     compared = compared_of((16, 8), np.random.default_rng(3))
-    assert choose_support(replace(compared, known=np.zeros_like(compared.known))).half_px == (ROWS[0], COLUMNS[0])
+    assert half_px(choose_support(replace(compared, known=np.zeros_like(compared.known)))) == (ROWS[0], COLUMNS[0])
     dark = replace(compared, residual=compared.residual * 0.0 - compared.light)
-    assert choose_support(dark).half_px == (ROWS[0], COLUMNS[0])
+    assert half_px(choose_support(dark)) == (ROWS[0], COLUMNS[0])
 
 
 @dataclass(frozen=True)
@@ -142,12 +148,12 @@ def test_whole_pictures_show_where_light_ends(tmp_path: Path, ends_px: int) -> N
     assert data.shots is not None
     sources = Sources(made.places, np.full((4, 3), 1e8), np.zeros(4))
     support = wide_support(data.shots, sources, made.term, rig)
-    assert support.seen_px == (64, 16)
-    assert support.half_px[0] == min(ends_px, 64)
-    rows, _ = fitted_size(with_support(made.term, support, rig), rig)
+    assert [one.tried[-1].fit for one in support] == [64, 16]
+    assert half_px(support)[0] == min(ends_px, 64)
+    term, notes = with_support(made.term, support, rig)
+    rows, _ = fitted_size(term, rig)
     assert rows == (47 if ends_px == 23 else kernel_size(rig)[0])
-    notes = support_notes(made.term, support)
-    assert any("as far as was looked" in note for note in notes) == (ends_px == 200 or support.open_ended[1])
+    assert any("as far as was looked" in note for note in notes) == (ends_px == 200 or half_px(support)[1] == 16)
 
 
 def test_an_image_ends_where_it_ends() -> None:
@@ -155,8 +161,8 @@ def test_an_image_ends_where_it_ends() -> None:
     geometry = nominal_geometry(rig)
     term = nominal_psf(rig, geometry, absent_wire(rig, geometry))
     image = replace(term, diffraction_fraction=np.float64(0.0), residual=np.ones((1, 3, 21, 11)))
-    support = Support((10, 5), (10, 5), ())
-    found = with_support(image, support, rig)
+    support = tuple(choose([Attempt("widest", 0, 0.0, half)]) for half in (10, 5))
+    found, notes = with_support(image, support, rig)
     np.testing.assert_array_equal(found.support_px, [5, 10])
     assert fitted_size(found, rig) == (21, 11)
-    assert not support_notes(image, support)
+    assert not notes

@@ -15,8 +15,8 @@ from tests.scenes.psf import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.diffraction import pattern_p_value, without_outliers
-from udccal.fitting.psf.read import cut_crop, shot_noise
-from udccal.fitting.psf.samples import Samples, choose_samples, sensor_variance, stands_for, weighed
+from udccal.fitting.psf.kernel import Samples
+from udccal.fitting.psf.start import choose_samples, cut_crop, shot_noise, stands_for
 from udccal.models.diffraction import LocalFrame
 
 SHOTS, SAMPLES = 6, 400
@@ -97,8 +97,8 @@ def test_the_model_error_is_always_a_number_within_bounds(
 def test_variance_follows_the_expected_light_not_the_noisy_one() -> None:
     rate = np.array([[90.0, 110.0]])
     samples = samples_of(rate, (rate + 4.0) / 2.0, noise_per_rate=0.5)
-    np.testing.assert_allclose(sensor_variance(samples, np.full((1, 1, 2), 100.0)), 52.0)
-    np.testing.assert_allclose(weighed(samples, 0.0, np.full((1, 1, 2), 100.0)).weight, 1 / 52.0)
+    np.testing.assert_allclose(samples.sensor_variance(np.full((1, 1, 2), 100.0)), 52.0)
+    np.testing.assert_allclose(samples.weighed(0.0, np.full((1, 1, 2), 100.0)).weight, 1 / 52.0)
 
 
 def test_the_slope_of_the_variance_is_that_of_the_exposure() -> None:

@@ -23,6 +23,8 @@ from udccal.result import FitStatus
 
 HUBER: Final = Huber()
 Crops = Float[np.ndarray, "shots rows columns"]
+Some = Float[np.ndarray, "*n"]
+Each = Float[np.ndarray, " samples"]
 # Numbers, and the shape for each shot; None is that of the rates.
 _ARRAYS: Final[dict[str, tuple[Numbers, tuple[int, ...] | None]]] = {
     "centre_px": ("real numbers", (2,)),
@@ -46,16 +48,13 @@ class PsfRules:
         least_positions: the fewest field positions that are fitted.
         half_px: largest window (rows, columns) to either side of the LED; the captured regions may bound it further.
         close_px: the same for the fit of diffraction, which takes longer in a larger window.
-        peak_half_px: all samples this close (rows, columns) to the LED go into the fit of diffraction.
-        far_fraction: fraction of the samples farther away that go into it.
+        peak_half_px, far_fraction: all samples this close (rows, columns) to the LED go into it, and this part of more.
         iterations: the most, in the fit of diffraction; far more than data take.
         first_model_error: of diffraction, before residuals give it; it also keeps a fit that is still far off from
             trusting the brightest samples alone.
-        spectrum_bend, spectrum_sigma: prior standard deviations of the logarithm of a spectrum: of its second
-            difference along the nodes, and about its start.
+        spectrum_bend, spectrum_sigma: prior sigmas of a log spectrum: of second differences, and about its start.
         blur_px, blur_log_sigma: prior of the blur in addition to pixel and disc: value, and sigma of its logarithm.
-        blur_growth, blur_colour: prior sigmas of that logarithm's growth over a focal length beside the axis, and of
-            its differences between colours.
+        blur_growth, blur_colour: prior sigmas of that logarithm's growth over a focal length, and between colours.
         wire_tolerance: part of the rig's tolerances that is left after the wire's fit.
         pitch_tolerance: part of the pitch's tolerance that the fit may use; see ``start_prior``.
         pitch_well_known: where the pitch's relative tolerance is larger, the nodes cover more wavelengths than
@@ -67,14 +66,13 @@ class PsfRules:
         highest_degree: of the residual's polynomials.
         reaches: parts of the window that may be enough for a residual, the narrowest first.
         worth: decrease of the held-out loss per sample that a higher order must reach (residuals then narrow by an
-            eighth): every restoration computes its ten thousand coefficients. Pictures held out have errors in common
-            with the others: on a full-size rig of wave optics a residual gained 0.17, but its kernel at new places
-            was a fifth worse.
-        worth_of_room: the same for a wider residual, which costs less: it adds no component, but enlarges one.
+            eighth): every restoration computes its ten thousand coefficients. Pictures held out share errors with the
+            others: on a full-size rig of wave optics a residual gained 0.17, but was a fifth worse elsewhere.
+        worth_of_room: the same for a wider residual, which adds no component, but enlarges one.
         doubtful: relative L2 error of diffraction alone from which an image without diffraction is tried too.
         free_model_error: of such an image, before positions held out give it.
-        own_sigma: prior standard deviations of a shot's place, in px, and relative light, along with such an image:
-            centroids and sums of a crop's light have this accuracy.
+        own_sigma: prior sigmas of a shot's place, in px, and relative light, along with such an image: centroids and
+            sums of a crop's light have this accuracy.
         error_samples: the most samples within a factor of three in brightness that the kernel error is taken from.
         error_knee, error_power: priors of the kernel error's knee and power; the knee's sigma is of its logarithm.
         poor: relative L2 error at positions held out from which the fit is poor.
@@ -149,19 +147,14 @@ class Shots:
     def __post_init__(self) -> None:
         crops: tuple[int, ...] = getattr(self.rate, "shape", ())
         if len(crops) != 3 or not crops[1] % 2 or not crops[2] % 2:
-            found = found_instead(self.rate)
-            raise FitError(
-                f"Expected rates of shots x odd rows x odd columns, found {found}. Crop about a middle sample."
-            )
+            rates = f"Expected rates of shots x odd rows x odd columns, found {found_instead(self.rate)}"
+            raise FitError(f"{rates}. Crop about a middle sample.")
         for name, (kinds, shape) in _ARRAYS.items():
             array, expected = getattr(self, name), crops if shape is None else (crops[0], *shape)
             check_array(array, name, kinds, expected, "Give each shot its own.", FitError)
         positions = np.unique(self.position)
         if not np.array_equal(positions, np.arange(len(positions))):
             raise FitError(f"Expected positions without gaps, found {positions[:8].tolist()}. Number them from 0.")
-        self._check_numbers()
-
-    def _check_numbers(self) -> None:
         known = self.weight > 0
         possible = np.isfinite(self.weight) & (self.weight >= 0) & (self.channel >= 0) & (self.channel <= 2)
         possible &= ~known | (np.isfinite(self.rate) & np.isfinite(self.noise_per_rate) & (self.noise_per_rate >= 0))
@@ -169,13 +162,12 @@ class Shots:
         possible &= places[:, None, None]
         if not possible.all():
             shot, row, column = np.argwhere(~possible)[0].tolist()
-            expected = "Expected finite places, rates and noise, weights of 0 or more, and channels 0, 1 and 2"
+            wanted = "Expected finite places, rates and noise, weights of 0 or more, and channels 0, 1 and 2"
             found = f"{np.sum(~possible)} samples without, the first in shot {shot}, row {row}, column {column}"
-            raise FitError(f"{expected}, found {found}. Give weight 0 to samples of which nothing is known.")
+            raise FitError(f"{wanted}, found {found}. Give weight 0 to samples of which nothing is known.")
         for name in ("rate", "noise_per_rate"):
-            values = getattr(self, name)
             # Zero times NaN would be NaN in every sum.
-            if not np.isfinite(values).all():
+            if not np.isfinite(values := getattr(self, name)).all():
                 object.__setattr__(self, name, np.where(known, values, 0.0))
 
     @property
@@ -234,13 +226,13 @@ def joined(crops: Sequence[Shots], aims_px: Float[np.ndarray, "shots 2"]) -> Sho
 def group(aims_px: Float[np.ndarray, "shots 2"]) -> Int[np.ndarray, " shots"]:
     """Return the index of each shot's field position: aims within 4 px of a position's first belong to it."""
     firsts: list[Float[np.ndarray, "2"]] = []
-    index = np.zeros(len(aims_px), dtype=np.int64)
-    for i, aim in enumerate(aims_px):
-        near = [g for g, first in enumerate(firsts) if np.abs(aim - first).max() <= 4.0]
-        index[i] = near[0] if near else len(firsts)
-        if not near:
+    index: list[int] = []
+    for aim in aims_px:
+        near = (g for g, first in enumerate(firsts) if np.abs(aim - first).max() <= 4.0)
+        index.append(next(near, len(firsts)))
+        if index[-1] == len(firsts):
             firsts.append(aim)
-    return index
+    return np.array(index, dtype=np.int64)
 
 
 def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:
@@ -266,15 +258,15 @@ class PsfData:
 
     def unfit(self, rules: PsfRules) -> tuple[FitStatus, str] | None:
         """Return why these data cannot be fitted, or None."""
-        most = 0.5 * max(self.taken, 1)
+        most, shots = 0.5 * max(self.taken, 1), self.shots
         if self.clipped > most:
             return FitStatus.SATURATED, f"{self.clipped} of {self.taken} pictures are clipped."
         if self.dark > most:
             return FitStatus.TOO_DARK, f"{self.dark} of {self.taken} pictures show no LED."
-        if self.shots is not None and self.shots.positions < rules.least_positions:
+        if shots is not None and shots.positions < rules.least_positions:
             seen = "have a sample of which something is known" if self.unknown else "were captured"
             needed = f"{rules.least_positions} are needed at least."
-            return FitStatus.TOO_FEW_DATA, f"{self.shots.positions} field positions {seen}; {needed}"
+            return FitStatus.TOO_FEW_DATA, f"{shots.positions} field positions {seen}; {needed}"
         return None
 
     def known(self, rules: PsfRules) -> PsfData:
@@ -292,24 +284,14 @@ def left_out(light: Float[np.ndarray, "*shots n"], model_error: float) -> Float[
     return model_error * size**0.75 * size.max(axis=-1, keepdims=True) ** 0.25
 
 
-def noise_at(
-    level: Float[np.ndarray, "*n"],
-    rate: Float[np.ndarray, "*n"],
-    measured: Float[np.ndarray, "*n"],
-    noise_per_rate: Float[np.ndarray, "*n"],
-) -> Float[np.ndarray, "*n"]:
+def noise_at(level: Some, rate: Some, measured: Some, noise_per_rate: Some) -> Some:
     """Return the variance of samples of true rate ``level``; it was ``measured`` at the observed ``rate``."""
     change = noise_per_rate * (np.maximum(level, 0.0) - np.maximum(rate, 0.0))
     # A sensor without read noise has no variance at all where no light is expected.
     return np.maximum(measured + change, 1e-2 * measured)
 
 
-def estimate_model_error(
-    residual: Float[np.ndarray, " samples"],
-    variance: Float[np.ndarray, " samples"],
-    unit: Float[np.ndarray, " samples"],
-    parameters: int,
-) -> float:
+def estimate_model_error(residual: Each, variance: Each, unit: Each, parameters: int) -> float:
     """Return the model error of greatest likelihood, or 0 where BIC prefers noise alone (``variance``).
 
     ``unit`` is the standard deviation that a model error of 1 adds to a sample. Residuals are smaller than errors by

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.special import ndtr
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse, square_root
@@ -18,22 +18,9 @@ from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
-from udccal.fitting.psf.kernel import FOOTPRINT, PUPIL, Evaluator, fit_lattice
-from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of
-from udccal.fitting.psf.samples import (
-    Lights,
-    Own,
-    Owns,
-    Samples,
-    Theta,
-    choose_samples,
-    flux_of,
-    gather,
-    sensor_variance,
-    stands_for,
-    start_own,
-    weighed,
-)
+from udccal.fitting.psf.kernel import FOOTPRINT, PUPIL, Evaluator, Light, Own, Samples, Theta, fit_lattice, gather
+from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
+from udccal.fitting.psf.start import choose_samples, stands_for
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_two_threads
@@ -67,7 +54,7 @@ class DiffractionFit:
 
     @property
     def theta(self) -> Float[np.ndarray, " p"]:
-        """The shared parameters, in the order of ``kernel.pack``."""
+        """The shared parameters, in the order of ``start.pack``."""
         return self.solution.place.theta
 
     @property
@@ -96,10 +83,9 @@ class DiffractionFit:
         Then it does not average out over positions as it does in ``cov``. Along directions in which it would change
         the kernel by more than its ``kernel_error`` at positions held out (relative L2), it is no larger than that.
         """
-        weight, cov = self.problem.samples.weight, self.cov()
-        positions = int((weight.reshape(len(weight), -1) > 0).any(axis=1).sum())
+        positions, cov = int((self.problem.samples.weight > 0).any(axis=(1, 2)).sum()), self.cov()
         root = square_root(max(positions - 1, 0) * (cov - self.noise_cov))
-        square, ways = np.linalg.eigh(root.T @ kernel_metric(self) @ root)
+        square, ways = np.linalg.eigh(root.T @ self._kernel_metric() @ root)
         most = np.minimum(1.0, kernel_error**2 / np.maximum(square, 1e-300))
         along = root @ ways
         return cov + (along * most) @ along.T
@@ -110,9 +96,31 @@ class DiffractionFit:
         dof = max(self.problem.used - self.problem.unknowns, 1)
         return (self.solution.equations.cost - self.problem.prior.cost(self.theta)) / dof
 
-    def errors(self) -> Lights:
-        """Data less expectation in units of sigma."""
-        return self.problem.errors(self.solution.place)
+    def efficiency(self, rules: PsfRules, available: int, reported: int) -> float:
+        """Return the variance by all samples of all pictures over the fit's variance, as a mean over parameters.
+
+        Samples drawn away from the peak represent all samples there; the fit's pictures represent all that are
+        ``available``. The mean is over the first ``reported`` parameters.
+        """
+        samples, count = self.problem.samples, stands_for(self.shots, rules)[self.problem.samples.index]
+        every = replace(self.problem, samples=replace(samples, weight=samples.weight * count))
+        information = sum(one.marginal()[0] for one in every.by_position(self.solution.place))
+        best = scaled_inverse(self.problem.prior.precision + information * available / self.shots.count)
+        return float(np.mean(np.diag(best)[:reported] / np.diag(self.noise_cov)[:reported]))
+
+    def _kernel_metric(self) -> Float[np.ndarray, "p p"]:
+        """Return the square of the kernel's relative L2 change at the first position, in all colours, by parameters."""
+        one, place = self.problem.samples.at(0), self.solution.place
+        # All samples of a colour have equal weights; padding has none.
+        even = (one.colour / np.maximum(one.colour.sum(axis=1, keepdims=True), 1)).sum(axis=-1)
+        flux = one.flux(place.own[0])
+        weight = np.where(flux > 0, even / np.where(flux > 0, flux, 1.0) ** 2, 0.0)
+        square = np.einsum("sn,snp,snq->pq", weight, place.by_theta[0], place.by_theta[0], optimize=True)
+        return np.asarray(square / float((weight * place.light[0] ** 2).sum()))
+
+    def kernel_sigma(self, cov: Float[np.ndarray, "p p"]) -> float:
+        """Return the relative L2 sigma of the kernel at the first position, in all colours."""
+        return float(np.sqrt(max(float(np.sum(self._kernel_metric() * cov)), 0.0)))
 
 
 def fit_diffraction(
@@ -123,18 +131,24 @@ def fit_diffraction(
     ``start`` gives the nodes of the spectra. With a ``visibility``, the footprint's place on the rows is known, and
     ``phase`` says whether the data show it. The mean of the ``prior`` is the start.
     """
-    chosen = choose_samples(shots, rules)
-    evaluator = Evaluator(
-        np.asarray(start.wavelengths_nm), fit_lattice(rules.close(shots.half)), bool(start.visibility)
-    )
+    chosen, lattice = choose_samples(shots, rules), fit_lattice(rules.close(shots.half))
+    evaluator = Evaluator(np.asarray(start.wavelengths_nm), lattice, bool(start.visibility))
     problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
-    fits = [_settled(problem, near, shots, geometry, chosen, rules) for near in _approach(problem, rules)]
+    fits, index = [], problem.samples.index
+    for near in _approach(problem, rules):
+        # To the minimum with the samples about the places of LEDs found there.
+        own, places = near.place.own.copy(), shots.centre_px.copy()
+        places[index[index >= 0]] += own[index >= 0][:, :2]
+        own[..., :2] = 0.0
+        moved = replace(shots, centre_px=places)
+        about = replace(problem, samples=gather(moved, geometry, chosen))
+        fits.append(_refine(about, moved, near.place.theta, own, rules, near.iterations))
     fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits))
     if not evaluator.interference:
         return fit
     phase = phase_evidence(fit)
     if phase.best is not phase.tried[0]:
-        alone = Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False)
+        alone = Evaluator(evaluator.wavelengths_nm, lattice, False)
         # Those of the fit hold corrections of interference.
         averaged = DiffractionProblem(gather(fit.shots, geometry, chosen), alone, prior)
         fit = _refine(averaged, fit.shots, fit.theta, fit.solution.place.own, rules, 0)
@@ -153,58 +167,48 @@ def _approach(problem: DiffractionProblem, rules: PsfRules) -> tuple[Solution[Pl
 
     def from_mean(problem: DiffractionProblem) -> Solution[Place, Blocks]:
         def start(one: Samples) -> Own:
-            return start_own(problem.evaluator, one, kernel_of(problem.evaluator, prior.mean, one))
+            return start_own(one, kernel_of(problem.evaluator, prior.mean, one))
 
         own = np.stack(in_two_threads(start, problem.samples.each()))
         return minimise(problem, problem.at(prior.mean, own), _solver(1e-3 * problem.used, rules.iterations))
 
-    first = from_mean(replace(problem, samples=weighed(problem.samples, rules.first_model_error)))
+    first = from_mean(replace(problem, samples=problem.samples.weighed(rules.first_model_error)))
     far = np.abs(first.place.theta - prior.mean) > _FAR_SIGMA * prior.sigma
     if not far[PUPIL] and not far[FOOTPRINT].any():
         return (first,)
     held = np.zeros(prior.mean.size, dtype=bool)
     held[FOOTPRINT] = True
-    return first, from_mean(replace(problem, samples=weighed(problem.samples, 0.0), held=held))
-
-
-def _settled(
-    problem: DiffractionProblem,
-    near: Solution[Place, Blocks],
-    shots: Shots,
-    geometry: Geometry,
-    chosen: Bool[np.ndarray, "shots rows columns"],
-    rules: PsfRules,
-) -> DiffractionFit:
-    """Go from a first descent's end to the minimum, with the samples about the places of LEDs found there."""
-    own, index, places = near.place.own.copy(), problem.samples.index, shots.centre_px.copy()
-    places[index[index >= 0]] += own[index >= 0][:, :2]
-    own[..., :2] = 0.0
-    moved = replace(shots, centre_px=places)
-    problem = replace(problem, samples=gather(moved, geometry, chosen))
-    return _refine(problem, moved, near.place.theta, own, rules, near.iterations)
+    return first, from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held))
 
 
 def _unlikely(fit: DiffractionFit) -> float:
     """Return minus twice the logarithm of the likelihood of all samples, outliers too, and of the prior."""
     place = fit.solution.place
-    samples = weighed(fit.problem.samples, fit.model_error, place.light, place.own[..., 5:])
+    samples = fit.problem.samples.weighed(fit.model_error, place.light, place.own[..., 5:])
     variances = float(-np.log(samples.weight[samples.weight > 0]).sum())
     return replace(fit.problem, samples=samples).equations_at(place).cost + variances
 
 
 def _refine(
-    problem: DiffractionProblem, shots: Shots, theta: Theta, own: Owns, rules: PsfRules, iterations: int
+    problem: DiffractionProblem, shots: Shots, theta: Theta, own: Own, rules: PsfRules, iterations: int
 ) -> DiffractionFit:
     """Go from near the minimum to the maximum of the likelihood.
 
-    The last round moves no parameter by a tenth of a sigma. Descents go to a hundredth of chi-squared once a change of
-    weights has little effect.
+    The last round moves nothing by a tenth of a sigma. Descents go to a hundredth of chi-squared once weights stay.
     """
     whole, enough, damping = None, 1.0, 1e6
     problem = problem.about(theta, own)
     place = problem.at(theta, own)
     for _ in range(15):
-        problem, model_error, found = _reweighed(problem, place, rules)
+        # Weights at the model's light, with the model error of the residuals, and without outliers.
+        samples, light, background = problem.samples, place.light, place.own[..., 5:]
+        seen, level = samples.known > 0, place.level
+        of_samples = samples.rate - level, samples.sensor_variance(level), left_out(light * seen, 1.0)
+        residual, variance, unit = (part[seen] for part in of_samples)
+        model_error = estimate_model_error(residual, variance, unit, problem.unknowns)
+        problem = replace(problem, samples=samples.weighed(model_error, light, background))
+        kept, found = without_outliers(problem.samples, problem.errors(place), rules)
+        problem = replace(problem, samples=kept)
         solution = minimise(problem, place, _solver(enough, rules.iterations - iterations, damping))
         iterations += solution.iterations
         change = solution.place.theta - place.theta
@@ -235,21 +239,7 @@ def _solver(enough: float, iterations: int, most_damping: float = 1e6) -> Solver
     return SolverRules(enough, stalled_gain=0.05, iterations=iterations, first_damping=1e-2, most_damping=most_damping)
 
 
-def _reweighed(
-    problem: DiffractionProblem, place: Place, rules: PsfRules
-) -> tuple[DiffractionProblem, float, tuple[Outliers, ...]]:
-    """Set weights at the model's light, with the model error of the residuals, and leave outliers out."""
-    samples, light, background = problem.samples, place.light, place.own[..., 5:]
-    seen, level = samples.known > 0, light + background
-    of_samples = (samples.rate - level, sensor_variance(samples, level), left_out(light * seen, 1.0))
-    residual, variance, unit = (part[seen] for part in of_samples)
-    model_error = estimate_model_error(residual, variance, unit, problem.unknowns)
-    problem = replace(problem, samples=weighed(samples, model_error, light, background))
-    kept, found = without_outliers(problem.samples, problem.errors(place), rules)
-    return replace(problem, samples=kept), model_error, found
-
-
-def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samples, tuple[Outliers, ...]]:
+def without_outliers(samples: Samples, z: Light, rules: PsfRules) -> tuple[Samples, tuple[Outliers, ...]]:
     """Return samples in which outliers have no weight, and a list of these: pictures, then samples of the others.
 
     In a picture that fits much worse than the others something moved, flickered or was in the way. It needs its own
@@ -264,9 +254,8 @@ def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samp
     rule = OutlierRule("samples")
     off = rule.off(z, used & ~moved[..., None])
     pictures = (f"picture {index[at]} at position {at[0]}" for at in zip(*np.nonzero(moved), strict=True))
-    named = (
-        f"picture {index[at[:2]]} at position {at[0]}, {z[at]:+.0f} sigma" for at in zip(*np.nonzero(off), strict=True)
-    )
+    places = zip(*np.nonzero(off), strict=True)
+    named = (f"picture {index[at[:2]]} at position {at[0]}, {z[at]:+.0f} sigma" for at in places)
     why = f"pictures whose mean squared residual is over {rules.picture_times:g} times the median picture's"
     kept = replace(samples, weight=weight * ~(off | moved[..., None]))
     return kept, (*outliers(why, pictures), *rule.listed(named))
@@ -275,13 +264,14 @@ def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samp
 def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
     """Compare a fit with interference to the same fit without it, to second order about the fit."""
     problem, place, here = fit.problem, fit.solution.place, fit.solution.equations
-    change = place.light - problem.light_of_average(place)
-    in_sigma = change * np.sqrt(problem.samples.weight)
+    samples, changes = problem.samples, ("overlaps", "correction", "by_overlaps")
+    none = replace(samples, **{name: np.zeros_like(getattr(samples, name)) for name in changes})
+    change = place.light - replace(problem, samples=none).at(place.theta, place.own, place).light
+    in_sigma = change * np.sqrt(samples.weight)
     score, alone = float((in_sigma * problem.errors(place)).sum()), float((in_sigma**2).sum())
     # Residuals change by so small a part of the phase's light that their outliers stay the same.
     part = 1e-3
-    moved = replace(problem.samples, rate=problem.samples.rate + part * change)
-    there = replace(problem, samples=moved).equations_at(place)
+    there = replace(problem, samples=replace(samples, rate=samples.rate + part * change)).equations_at(place)
     shared, own = (there.right - here.right) / part, (there.own_right - here.own_right) / part
     # Residuals that the other parameters can compensate hold no information on the strength.
     information = max(alone - replace(here, right=shared, own_right=own).step(0.0).gain, 1e-12)
@@ -293,37 +283,7 @@ def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
     )
 
 
-def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: int) -> float:
-    """Return the variance by all samples of all pictures over the fit's variance, as a mean over parameters.
-
-    Samples drawn away from the peak represent all samples there; the fit's pictures represent all that are
-    ``available``. The mean is over the first ``reported`` parameters.
-    """
-    samples, count = fit.problem.samples, stands_for(fit.shots, rules)[fit.problem.samples.index]
-    weighed_up = replace(samples, weight=samples.weight * count)
-    positions = replace(fit.problem, samples=weighed_up).by_position(fit.solution.place)
-    information = sum(position.marginal()[0] for position in positions) * available / fit.shots.count
-    best = scaled_inverse(fit.problem.prior.precision + information)
-    return float(np.mean(np.diag(best)[:reported] / np.diag(fit.noise_cov)[:reported]))
-
-
-def kernel_metric(fit: DiffractionFit) -> Float[np.ndarray, "p p"]:
-    """Return the square of the kernel's relative L2 change at the first position, in all colours, by the parameters."""
-    one, place = fit.problem.samples.at(0), fit.solution.place
-    # All samples of a colour have equal weights; padding has none.
-    even = (one.colour / np.maximum(one.colour.sum(axis=1, keepdims=True), 1)).sum(axis=-1)
-    flux = flux_of(one, place.own[0])
-    weight = np.where(flux > 0, even / np.where(flux > 0, flux, 1.0) ** 2, 0.0)
-    square = np.einsum("sn,snp,snq->pq", weight, place.by_theta[0], place.by_theta[0], optimize=True)
-    return np.asarray(square / float((weight * place.light[0] ** 2).sum()))
-
-
-def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
-    """Return the relative L2 sigma of the kernel at the first position, in all colours."""
-    return float(np.sqrt(max(float(np.sum(kernel_metric(fit) * cov)), 0.0)))
-
-
-def pattern_p_value(samples: Samples, z: Lights) -> float:
+def pattern_p_value(samples: Samples, z: Light) -> float:
     """Return the probability that noise alone makes residuals of a position's pictures at least as similar.
 
     Each picture has its own noise, and samples the kernel at its own fraction of a pixel. Residuals of one colour at

@@ -20,23 +20,23 @@ from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import SIGNIFICANT
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, about_middle, held_out_positions
-from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, fit_diffraction, kernel_sigma, pattern_p_value
+from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction, pattern_p_value
 from udccal.fitting.psf.held_out import (
-    SIGMA_NAMES,
+    STATED,
     KernelError,
     Support,
     choose_support,
     error_patterns,
     kernel_error,
     stated_error,
-    support_notes,
     wide_support,
     with_support,
 )
-from udccal.fitting.psf.kernel import BLUR, PITCH, as_numpy, pitch_tolerance, start_model, start_prior
+from udccal.fitting.psf.image import Magnitude
+from udccal.fitting.psf.kernel import BLUR, PITCH
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
-from udccal.fitting.psf.samples import some_shots
+from udccal.fitting.psf.start import as_numpy, pitch_tolerance, some_shots, start_model, start_prior
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
@@ -49,9 +49,13 @@ from udccal.rig import RigDescription
 _DIFFRACTION: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm")
 _BLUR: Final = ("blur_px", "blur_growth_radial", "blur_growth_tangential", "blur_red", "blur_blue")
 _NUMBERS: Final = (*_DIFFRACTION, *_BLUR)
-# Diagnostics that say what sigma would be if the model had no deviation; of these numbers, with their units.
+# Diagnostics that say what sigma would be if the model had no deviation; of these numbers.
 NOISE_SIGMA: Final = "noise_sigma_"
-_UNITS: Final = (("column_open", "1"), ("row_open", "1"), ("depth_mm", "mm"), ("pupil_diameter_mm", "mm"))
+# Units of diagnostics that have one.
+_UNITS: Final = dict.fromkeys(("support_rows", "support_columns"), "px") | {
+    f"{NOISE_SIGMA}{name}": "mm" for name in ("depth_mm", "pupil_diameter_mm")
+}
+Cov = Float[np.ndarray, "p p"]
 _LENGTHS: Final = np.isin(_NUMBERS, ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
 
 
@@ -76,7 +80,11 @@ def fit_psf(
     check_kind(data, PsfData, "Give the crops as one.", FitError)
     rules = rules or PsfRules()
     data, start = data.known(rules), start_model(rig, geometry, wire, rules)
-    unfit = _unfit(data, rig, rules)
+    unfit = data.unfit(rules)
+    if unfit is None and pitch_tolerance(rig) > rules.pitch_least_known:
+        pitch = rig.panel.pitch_mm
+        known = f"The panel's pitch is {pitch.value:g} ± {pitch.tolerance:g} mm in the rig's description."
+        unfit = FitStatus.POOR_FIT, f"{known} Measure it."
     if unfit is not None or data.shots is None:
         status, note = unfit or (FitStatus.TOO_FEW_DATA, "No field position was captured.")
         return FitResult.failed("psf", _field(start, geometry), status, note)
@@ -87,10 +95,11 @@ def fit_psf(
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
     selection = select_field(shots, sources, explained, (shots.positions_px() - size) / size, fit.model_error, rules)
     order, support = selection.trial.order, choose_support(selection.trial.compared)
+    half_px = support[0].best.fit, support[1].best.fit
     term = replace(
         _field(as_numpy(fit.problem.evaluator.model(fit.theta)), geometry),
         diffraction_fraction=np.float64(not order.free),
-        residual=about_middle(selection.image, support.half_px) if order.free else selection.image,
+        residual=about_middle(selection.image, half_px) if order.free else selection.image,
         centre_px=size,
         half_px=size,
         degree=max(order.degree, 0),
@@ -101,7 +110,7 @@ def fit_psf(
         # Two whole pictures of each of these positions are enough.
         looked_at = np.concatenate([np.flatnonzero(shots.position == p)[:2] for p in held_out])
         support = wide_support(data.shots.pick(looked_at), selection.trial.sources.pick(looked_at), term, rig)
-    return _report(data, shots, fit, selection, support, with_support(term, support, rig), rig, rules)
+    return _report(data, shots, fit, selection, support, term, rig, rules)
 
 
 def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField:
@@ -113,17 +122,6 @@ def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField
         wire: its numbers replace the rig's if the wire fit saw the rows.
     """
     return _field(start_model(rig, geometry, wire), geometry)
-
-
-def _unfit(data: PsfData, rig: RigDescription, rules: PsfRules) -> tuple[FitStatus, str] | None:
-    """Return why there can be no fit, or None."""
-    if unfit := data.unfit(rules):
-        return unfit
-    if pitch_tolerance(rig) > rules.pitch_least_known:
-        pitch = rig.panel.pitch_mm
-        known = f"The panel's pitch is {pitch.value:g} ± {pitch.tolerance:g} mm in the rig's description."
-        return FitStatus.POOR_FIT, f"{known} Measure it."
-    return None
 
 
 def _field(model: Diffraction, geometry: Geometry) -> PsfField:
@@ -152,22 +150,17 @@ def _report(
     rig: RigDescription,
     rules: PsfRules,
 ) -> FitResult[PsfField]:
-    trial, diffracts = selection.trial, not selection.trial.order.free
-    held_out_l2, held_out = trial.compared.relative_l2(), trial.compared.errors()
-    error = kernel_error(selection.everywhere, rules)
-    worst, status = float(np.sqrt((held_out_l2**2).mean())), FitStatus.CONVERGED
-    if not np.isfinite(worst) or worst > rules.poor:
+    found, diffracts, problem = selection.trial.compared, not selection.trial.order.free, fit.problem
+    held_out_l2, error = found.relative_l2(), kernel_error(selection.everywhere, rules)
+    status = FitStatus.NOT_CONVERGED if diffracts and not fit.converged else FitStatus.CONVERGED
+    # An error that is no number is poor, too.
+    if not float(np.sqrt((held_out_l2**2).mean())) <= rules.poor:
         status = FitStatus.POOR_FIT
-    elif diffracts and not fit.converged:
-        status = FitStatus.NOT_CONVERGED
-    tolerance, samples = pitch_tolerance(rig), fit.problem.samples
-    errors, used = fit.errors(), samples.weight > 0
-    pattern_p, error_l2 = pattern_p_value(samples, errors), float(error.relative_l2(selection.magnitude).mean())
+    z, used = problem.errors(fit.solution.place), problem.samples.weight > 0
+    pattern_p, error_l2 = pattern_p_value(problem.samples, z), float(error.relative_l2(selection.magnitude).mean())
     cov = fit.refuted_cov(error_l2 or np.inf) if pattern_p <= SIGNIFICANT else fit.cov()
-    by_parameters = kernel_sigma(fit, cov) if diffracts else 0.0
-    numbers, cov_of_numbers = _estimates(fit, diffracts, held_out_l2, cov, by_parameters, tolerance)
+    by_parameters = fit.kernel_sigma(cov) if diffracts else 0.0
     stated = stated_error(error, by_parameters, selection.magnitude, rules)
-    places = fit.shots.centre_px[np.broadcast_to(samples.index[..., None], used.shape)[used]]
     names = (f"held_out_l2_{name}" for name in ("red", "green", "blue"))
     figures = dict(zip(names, held_out_l2, strict=True)) | {
         "field_positions": shots.positions,
@@ -175,79 +168,70 @@ def _report(
         "samples_left_out": int((shots.weight <= 0).sum()),
         "iterations": fit.iterations,
         "kernel_error_l2": error_l2,
-        "residual_degree": trial.order.degree,
+        "residual_degree": selection.trial.order.degree,
         "diffraction_fraction": diffracts,
         "model_error": fit.model_error,
-        "efficiency": efficiency(fit, rules, shots.count, len(_NUMBERS)),
+        "efficiency": fit.efficiency(rules, shots.count, len(_NUMBERS)),
         "residual_pattern_p": pattern_p,
+        **{STATED + name: value for name, value in vars(stated).items()},
+        **_figures(fit, diffracts, support),
     }
-    figures |= dict(zip(SIGMA_NAMES, (stated.size, stated.knee, stated.power), strict=True))
-    if fit.phase:
-        figures["wire_phase_strength"], figures["wire_phase_strength_sigma"] = fit.phase.best.fit
-    lengths = zip(("support_rows", "support_columns"), support.half_px, strict=True)
-    by_noise = dict(zip(_NUMBERS, np.sqrt(np.diag(fit.noise_cov)), strict=False)) if diffracts else {}
     off = _said_to_be_off(stated, selection.magnitude) if error.size else ""
-    misfit = "" if diffracts else off
-    if diffracts and pattern_p <= SIGNIFICANT:
-        numbered = f"{', '.join(_NUMBERS)} are numbers of a model that they refute"
-        misfit = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {numbered}. {off}".rstrip()
+    l2, spread = float(held_out_l2.mean()), float(held_out_l2.std(ddof=1) / np.sqrt(held_out_l2.size))
+    numbers: tuple[Estimate, ...] = (Estimate("kernel_relative_l2", l2, spread, "1"),)
+    cov_of_numbers = np.array([[spread**2]])
+    if diffracts:
+        l2_sigma = float(np.hypot(by_parameters, spread))
+        numbers, cov_of_numbers = _estimates(fit, cov, l2, l2_sigma, pitch_tolerance(rig))
+    along = (candidate for choice in support for candidate in choice.candidates)
+    term, open_ended = with_support(term, support, rig)
+    places = fit.shots.centre_px[np.broadcast_to(problem.samples.index[..., None], used.shape)[used]]
     return FitResult(
         name="psf",
         term=term,
         status=status,
         estimates=numbers,
         cov=cov_of_numbers,
-        chi2_dof=fit.chi2_dof if diffracts else float(np.mean(held_out**2)),
-        samples=fit.problem.used if diffracts else len(held_out),
-        candidates=(*(fit.phase.candidates if fit.phase else ()), *selection.candidates, *support.candidates),
-        diagnostics=(
-            *(Diagnostic(name, float(value), "1") for name, value in figures.items()),
-            *(Diagnostic(name, float(value), "px") for name, value in lengths),
-            *(Diagnostic(f"{NOISE_SIGMA}{name}", float(by_noise[name]), unit) for name, unit in _UNITS if by_noise),
-        ),
-        notes=_notes(data, diffracts, misfit, support_notes(term, support)),
+        chi2_dof=fit.chi2_dof if diffracts else float(np.mean((found.residual**2 / found.total)[found.known])),
+        samples=problem.used if diffracts else int(found.known.sum()),
+        candidates=(*(fit.phase.candidates if fit.phase else ()), *selection.candidates, *along),
+        diagnostics=tuple(Diagnostic(name, float(value), _UNITS.get(name, "1")) for name, value in figures.items()),
+        notes=_notes(data, diffracts, pattern_p, off, open_ended),
         outliers=fit.outliers,
-        residuals=residual_sample(places, errors[used]) if diffracts else None,
-        posterior=_posterior(fit, diffracts, error, term, rig, cov, tolerance),
+        residuals=residual_sample(places, z[used]) if diffracts else None,
+        posterior=_posterior(fit, cov, error, term, rig),
     )
 
 
+def _figures(fit: DiffractionFit, diffracts: bool, support: Support) -> dict[str, float]:
+    figures = {}
+    if fit.phase:
+        figures["wire_phase_strength"], figures["wire_phase_strength_sigma"] = fit.phase.best.fit
+    figures["support_rows"], figures["support_columns"] = (one.best.fit for one in support)
+    by_noise = list(zip(_DIFFRACTION, np.sqrt(np.diag(fit.noise_cov)), strict=False)) if diffracts else []
+    return figures | {NOISE_SIGMA + name: sigma for name, sigma in by_noise[1:]}
+
+
 def _estimates(
-    fit: DiffractionFit,
-    diffracts: bool,
-    held_out_l2: Float[np.ndarray, "3"],
-    whole: Float[np.ndarray, "p p"],
-    by_parameters: float,
-    tolerance: float,
+    fit: DiffractionFit, whole: Cov, l2: float, l2_sigma: float, tolerance: float
 ) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
-    count, error = len(_NUMBERS), float(held_out_l2.mean())
-    spread = float(held_out_l2.std(ddof=1) / np.sqrt(held_out_l2.size))
-    if not diffracts:
-        return (Estimate("kernel_relative_l2", error, spread, "1"),), np.array([[spread**2]])
+    """Return the numbers of diffraction, and the error ``l2`` of kernels; ``tolerance`` is the pitch's."""
+    count, prior = len(_NUMBERS), fit.problem.prior
+    values, known, sigma, unit = *(v[:count].copy() for v in (fit.theta, prior.mean, prior.sigma)), np.ones(count)
     # The fit's own parameter is the logarithm of the blur.
-    prior = fit.problem.prior
-    values, unit, known, wide = fit.theta[:count].copy(), np.ones(count), prior.mean[:count].copy(), np.ones(count)
-    values[BLUR] = unit[BLUR] = np.exp(fit.theta[BLUR])
-    known[BLUR] = wide[BLUR] = np.exp(prior.mean[BLUR])
-    sigma = prior.sigma[:count] * wide
+    values[BLUR], known[BLUR] = np.exp([values[BLUR], known[BLUR]])
+    unit[BLUR], sigma[BLUR] = values[BLUR], sigma[BLUR] * known[BLUR]
     # The fit holds the pitch: its tolerance scales all lengths.
     sigma[PITCH] = known[PITCH] * tolerance
     by_pitch = np.where(_LENGTHS, values, 0.0) * tolerance
     cov = whole[:count, :count] * np.outer(unit, unit) + np.outer(by_pitch, by_pitch)
     # The error of kernels is that of held-out positions, which the numbers do not depend on.
-    cov = block_diag(cov, by_parameters**2 + spread**2)
-    names, priors = (*_NUMBERS, "kernel_relative_l2"), priors_of(_NUMBERS, known, sigma)
-    return estimates("psf", names, np.append(values, error), cov, priors), cov
+    cov, names = block_diag(cov, l2_sigma**2), (*_NUMBERS, "kernel_relative_l2")
+    return estimates("psf", names, np.append(values, l2), cov, priors_of(_NUMBERS, known, sigma)), cov
 
 
 def _posterior(
-    fit: DiffractionFit,
-    diffracts: bool,
-    error: KernelError,
-    term: PsfField,
-    rig: RigDescription,
-    cov: Float[np.ndarray, "p p"],
-    tolerance: float,
+    fit: DiffractionFit, cov: Cov, error: KernelError, term: PsfField, rig: RigDescription
 ) -> Posterior[PsfField]:
     """Return the posterior of the parameters of diffraction, of the pitch, and of the kernel's error without noise.
 
@@ -257,9 +241,9 @@ def _posterior(
     """
     count, evaluator, patterns = fit.theta.size, fit.problem.evaluator, 16 if error.size else 0
     factor = np.zeros((count + 1 + patterns, count + 1 + patterns))
-    if diffracts:
+    if term.diffraction_fraction:
         factor[:count, :count] = square_root(cov)
-        factor[count, count] = tolerance
+        factor[count, count] = pitch_tolerance(rig)
     factor[count + 1 :, count + 1 :] = np.eye(patterns) / np.sqrt(max(patterns, 1))
     # A result lives long and the data are large: the function below keeps only what it needs.
     size_and_signs = cache(lambda: error_patterns(term, error, rig, patterns))
@@ -281,23 +265,22 @@ def _posterior(
     return Posterior(np.concatenate([fit.theta, np.zeros(1 + patterns)]), factor, term_at)
 
 
-def _said_to_be_off(stated: KernelError, magnitude: Float[np.ndarray, "3 rows columns"]) -> str:
+def _said_to_be_off(stated: KernelError, magnitude: Magnitude) -> str:
     whole, faint = (100 * float(np.mean(part(magnitude))) for part in (stated.relative_l2, stated.relative_rms))
     where = "where it was not captured, and its faint parts, down to 1e-4 of the peak,"
     return f"The kernel is off by {whole:.2g} % {where} by {faint:.2g} %; sigmas include that."
 
 
-def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]) -> tuple[str, ...]:
-    notes = [
-        "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is known.",
-        "chi2_dof is of that image at positions held out, and allows for their model error.",
-    ]
+def _notes(data: PsfData, diffracts: bool, pattern_p: float, off: str, support: tuple[str, ...]) -> tuple[str, ...]:
+    image = "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is known."
+    notes = [image, "chi2_dof is of that image at positions held out, and allows for their model error."]
     if diffracts:
-        notes = [
-            "cov leaves out spectra and field coefficients of the residual.",
-            "chi2_dof is of the fit of diffraction and allows for the model error of its residuals.",
-        ]
-    notes += [misfit] if misfit else []
+        refuted = f"{', '.join(_NUMBERS)} are numbers of a model that they refute. {off}".rstrip()
+        pattern = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {refuted}"
+        off = pattern if pattern_p <= SIGNIFICANT else ""
+        notes = ["cov leaves out spectra and field coefficients of the residual."]
+        notes += ["chi2_dof is of the fit of diffraction and allows for the model error of its residuals."]
+    notes += [off] if off else []
     if data.doubted:
         notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")
     left_out, why = data.dark + data.clipped, f"{data.dark} without an LED, {data.clipped} clipped."

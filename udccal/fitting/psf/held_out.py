@@ -1,29 +1,87 @@
-"""What positions that were held out show of a kernel: its error, and how far its light reaches.
+"""What samples that a solution has not used show of a kernel: its error, and how far its light reaches.
 
 The kernel's error includes the model's deviation from the truth, and the errors of its parameters that follow from it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import final
 
 import numpy as np
 import scipy.optimize
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
-from udccal.fitting.psf.data import HUBER, PsfRules, Shots, about_middle
-from udccal.fitting.psf.image import Sources, make_windows, predict
-from udccal.fitting.psf.orders import Compared, compare
+from udccal.fitting.psf.data import HUBER, Crops, Each, PsfRules, Shots, about_middle, estimate_model_error, noise_at
+from udccal.fitting.psf.image import Magnitude, Sources, Windows, make_windows
 from udccal.kernels import kernel_size, kernels_at
 from udccal.models.fields import polynomial_basis
 from udccal.models.psf import PsfField
-from udccal.result import Candidate, FitResult
+from udccal.result import FitResult
 from udccal.rig import RigDescription
 
-# The diagnostics that state the sigma of a kernel's samples: the fields of ``KernelError``.
-SIGMA_NAMES = ("kernel_sigma_size", "kernel_sigma_knee", "kernel_sigma_power")
+# The diagnostics that state the sigma of a kernel's samples begin so; the fields of ``KernelError`` follow.
+STATED = "kernel_sigma_"
+# (Rows, columns) to either side of the source, of all that were tried up to those that pictures hold.
+Support = tuple[Choice[int], Choice[int]]
+
+
+@final
+@dataclass(frozen=True)
+class Compared:
+    """Samples that a solution has not used, and its expectation of them.
+
+    Attributes:
+        residual, light: in e-/s.
+        measured, variance: variance of the sensor's noise, as measured, and at the expected light.
+        left_out: standard deviation that a model error of 1 would add.
+        known: True for samples that were measured.
+        channel: each sample's colour; flux: the LED's light in that colour, in e-/s.
+        model_error: the one of greatest likelihood for the residuals.
+    """
+
+    residual: Crops
+    light: Crops
+    measured: Crops
+    variance: Crops
+    left_out: Crops
+    known: Bool[np.ndarray, "shots rows columns"]
+    channel: Int[np.ndarray, "shots rows columns"]
+    flux: Crops
+    model_error: float
+
+    @property
+    def total(self) -> Crops:
+        """Variance of samples, with the model error."""
+        return self.variance + (self.model_error * self.left_out) ** 2
+
+    def relative_l2(self) -> Float[np.ndarray, "3"]:
+        """Return the expectation's error by colour, which includes the data's own noise."""
+        channel = self.channel[self.known]
+        error, light = (np.bincount(channel, part[self.known] ** 2, 3) for part in (self.residual, self.light))
+        return np.sqrt(error / np.maximum(light, 1e-30))
+
+    def loss(self, position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
+        """Return minus twice the log likelihood per sample, up to a constant, by position.
+
+        The model's deviation is common to the pictures of a position. For a single position, the loss is by picture.
+        """
+        each = (np.log(self.total / self.measured) + HUBER.loss(self.residual / np.sqrt(self.total))) * self.known
+        by_shot = each.sum(axis=(1, 2)) / np.maximum(self.known.sum(axis=(1, 2)), 1)
+        places = np.unique(position)
+        return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot
+
+
+def compare(shots: Shots, windows: Windows, light: Crops) -> Compared:
+    """Compare the shots with the ``light`` (e-/s) that is expected of them."""
+    known, residual = shots.weight > 0, windows.rate - light
+    measured = 1.0 / np.where(known, shots.weight, 1.0)
+    variance = noise_at(light, windows.rate, measured, shots.noise_per_rate)
+    # All orders have the same deviation here; it is above 0 where one of them expects no light.
+    unit, channel, flux = windows.left_out, windows.channel, windows.flux
+    model_error = estimate_model_error(residual[known], variance[known], unit[known], 0)
+    return Compared(residual, light, measured, variance, unit, known, channel, flux, model_error)
 
 
 @final
@@ -61,11 +119,7 @@ class KernelError:
 
 
 def estimate_kernel_error(
-    residual: Float[np.ndarray, " samples"],
-    variance: Float[np.ndarray, " samples"],
-    brightness: Float[np.ndarray, " samples"],
-    picture: Int[np.ndarray, " samples"],
-    rules: PsfRules,
+    residual: Each, variance: Each, brightness: Each, picture: Int[np.ndarray, " samples"], rules: PsfRules
 ) -> KernelError:
     """Return the most probable error, or a size of 0 where BIC prefers noise alone.
 
@@ -85,11 +139,11 @@ def estimate_kernel_error(
     weight = np.minimum(rules.error_samples / np.bincount(level), 1.0)[level]
     mean, sigma = np.array([(np.log(rules.error_knee[0]), rules.error_knee[1]), rules.error_power]).T
 
-    def of_residuals(samples: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-        """Return what a symmetric matrix makes of the samples' variances: those of residuals."""
+    # A symmetric matrix makes variances of residuals of those of samples.
+    def of_residuals(samples: Each) -> Each:
         return np.asarray(alone * samples + along * np.bincount(picture, along * samples)[picture])
 
-    def misfit(variance: Float[np.ndarray, " samples"]) -> tuple[float, Float[np.ndarray, " samples"]]:
+    def misfit(variance: Each) -> tuple[float, Each]:
         """Return the cost of these variances, and its derivatives by them."""
         total = of_residuals(variance)
         # Beyond 5 sigma the loss grows as a logarithm: a cosmic hit counts little, a large model error still counts.
@@ -97,11 +151,11 @@ def estimate_kernel_error(
         each = np.log(total) + 25.0 * np.where(square < 1, square, 1 + np.log(np.maximum(square, 1)))
         return float(weight @ each), of_residuals(weight * (1 - 25.0 * np.minimum(square, 1)) / total)
 
-    def of(values: Float[np.ndarray, "3"]) -> KernelError:
-        return KernelError(float(np.exp(values[0])), float(np.exp(values[1])), float(values[2]))
+    def of(size: float, knee: float, power: float) -> KernelError:
+        return KernelError(float(np.exp(size)), float(np.exp(knee)), float(power))
 
     def loss(values: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
-        error, bend = of(values).of_peak(brightness), brightness / np.exp(values[1])
+        error, bend = of(*values).of_peak(brightness), brightness / np.exp(values[1])
         cost, slope = misfit(variance + error**2)
         off = (values[1:] - mean) / sigma
         by = np.stack([np.ones_like(bend), values[2] * bend / (1 + bend), np.log(brightness / (1 + bend))])
@@ -112,7 +166,7 @@ def estimate_kernel_error(
     tried = [scipy.optimize.minimize(loss, (np.log(size), *mean), **options) for size in (1e-3, 1e-2, 1e-1)]
     found = min(tried, key=lambda one: float(one.fun))
     worth = bic(float(found.fun), float(len(bounds)), round(weight.sum())) < misfit(variance)[0]
-    return of(found.x) if worth else KernelError(0.0)
+    return of(*found.x) if worth else KernelError(0.0)
 
 
 def kernel_error(found: Compared, rules: PsfRules) -> KernelError:
@@ -123,23 +177,15 @@ def kernel_error(found: Compared, rules: PsfRules) -> KernelError:
     full = flux * np.array([unit[channel == colour].max(initial=1e-300) for colour in range(3)])[channel]
     seen = found.known & (full > 0)
     full, picture = full[seen], (3 * np.arange(len(channel))[:, None, None] + channel)[seen]
-    return estimate_kernel_error(
-        found.residual[seen] / full, found.variance[seen] / full**2, found.light[seen] / full, picture, rules
-    )
+    residual, variance, light = found.residual[seen] / full, found.variance[seen] / full**2, found.light[seen] / full
+    return estimate_kernel_error(residual, variance, light, picture, rules)
 
 
-def stated_error(
-    error: KernelError, by_parameters: float, magnitude: Float[np.ndarray, "3 rows columns"], rules: PsfRules
-) -> KernelError:
+def stated_error(error: KernelError, by_parameters: float, magnitude: Magnitude, rules: PsfRules) -> KernelError:
     """Return the sigma of a kernel's samples by all that the fit states of it, in the shape of the held-out error.
 
-    That error holds the parameters' errors at positions held out, and so has their shape.
-
-    Args:
-        error: of positions held out, without noise; of size 0 where they show none.
-        by_parameters: relative L2 sigma of the kernel by the covariance of the parameters.
-        magnitude: the kernel's average size.
-        rules: the shape where no error was found.
+    That error, which may be 0, holds the parameters' errors at positions held out, and so has their shape.
+    ``by_parameters`` is the kernel's relative L2 sigma by their covariance, ``magnitude`` its average size.
     """
     shape = error if error.size else KernelError(1.0, rules.error_knee[0], rules.error_power[0])
     unit = float(shape.relative_l2(magnitude).mean()) / shape.size
@@ -148,8 +194,9 @@ def stated_error(
 
 def stated_by(result: FitResult[PsfField]) -> KernelError | None:
     """Return the same of a result, or of a profile's; None where the fit does not state it."""
-    size, knee, power = (result.diagnostic(name) for name in SIGMA_NAMES)
-    return None if size is None or knee is None or power is None else KernelError(size, knee, power)
+    found = [result.diagnostic(STATED + field.name) for field in fields(KernelError)]
+    stated = [value for value in found if value is not None]
+    return KernelError(*stated) if len(stated) == len(found) else None
 
 
 def error_patterns(
@@ -168,22 +215,6 @@ def error_patterns(
     return degree, np.tensordot(np.linalg.pinv(basis), sizes, axes=1), signs
 
 
-@final
-@dataclass(frozen=True)
-class Support:
-    """Support of the kernel: (rows, columns) to either side of the source, those that pictures hold, and all tried."""
-
-    half_px: tuple[int, int]
-    seen_px: tuple[int, int]
-    candidates: tuple[Candidate, ...]
-
-    @property
-    def open_ended(self) -> tuple[bool, bool]:
-        """Along (rows, columns), True if light reaches the end of the pictures' windows."""
-        rows, columns = (chosen >= seen for chosen, seen in zip(self.half_px, self.seen_px, strict=True))
-        return rows, columns
-
-
 def choose_support(found: Compared) -> Support:
     """Choose the smallest window outside of which samples that the model has not used show none of the kernel's light.
 
@@ -192,9 +223,8 @@ def choose_support(found: Compared) -> Support:
     window: real light lowers chi-squared by many times that, and light that only the model has does not.
     """
     rows, columns = (size // 2 for size in found.residual.shape[1:])
-    y, x = np.mgrid[-rows : rows + 1, -columns : columns + 1]
-    down, across = _along(found, "rows", np.abs(y)), _along(found, "columns", np.abs(x))
-    return Support((down.best.fit, across.best.fit), (rows, columns), (*down.candidates, *across.candidates))
+    y, x = np.abs(np.mgrid[-rows : rows + 1, -columns : columns + 1])
+    return _along(found, "rows", y), _along(found, "columns", x)
 
 
 def windows_to_try(largest_px: int) -> tuple[int, ...]:
@@ -224,7 +254,7 @@ def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescript
     kernels = about_middle(kernels_at(term, wide.positions_px(), rows, columns).astype(np.float64), wide.half)
     at_position = np.eye(wide.positions)[wide.position]
     windows = make_windows(wide, sources, np.zeros_like(wide.rate), at_position, 0.0)
-    light = predict(windows, kernels)
+    light = windows.unit_light(kernels)
     windows = make_windows(wide, sources.with_light_of_peak(wide, light), light, at_position, 0.0)
     found = compare(wide, windows, light * windows.flux)
     # Near the source, whole pixels are too coarse for a kernel that moves by fractions of one; all windows hold it.
@@ -232,21 +262,17 @@ def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescript
     return choose_support(replace(found, known=found.known & ~core))
 
 
-def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfField:
-    """Return the term with this support of its kernel.
+def with_support(term: PsfField, support: Support, rig: RigDescription) -> tuple[PsfField, tuple[str, ...]]:
+    """Return the term with this support of its kernel, and the notes for axes along which no end of it was seen.
 
-    Diffraction reaches over the whole sensor where the pictures show no end of it; an image ends at the support.
+    Diffraction reaches over the whole sensor where light reaches the end of the pictures; an image ends at the support.
     """
-    size = (rig.camera.rows, rig.camera.columns)
-    onward = (seen and bool(term.diffraction_fraction) for seen in support.open_ended)
-    down, across = (most if on else half for half, on, most in zip(support.half_px, onward, size, strict=True))
-    return replace(term, support_px=np.array([across, down], dtype=np.float64))
-
-
-def support_notes(term: PsfField, support: Support) -> tuple[str, ...]:
-    """Return the notes for axes along which no end of the kernel's light was seen."""
-    along = [name for name, on in zip(("columns", "rows"), support.open_ended, strict=True) if on]
-    if not along or not term.diffraction_fraction:
-        return ()
+    down, across = (one.best is one.tried[-1] and bool(term.diffraction_fraction) for one in support)
+    rows, columns = (one.best.fit for one in support)
+    half_px = [rig.camera.columns if across else columns, rig.camera.rows if down else rows]
+    term = replace(term, support_px=np.array(half_px, dtype=np.float64))
+    if not (down or across):
+        return term, ()
+    along = " and ".join(["columns"] * down + ["rows"] * across)
     seen = "light was seen as far as was looked; beyond, the kernel is diffraction as fitted."
-    return (f"Along {' and '.join(along)} {seen}",)
+    return term, (f"Along {along} {seen}",)

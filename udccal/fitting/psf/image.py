@@ -27,6 +27,8 @@ from udccal.fitting.psf.data import Crops, PsfRules, Shots, left_out, noise_at
 
 FREE_PER_PX: Final = 2
 Image = Float[np.ndarray, "terms 3 node_rows node_columns"]
+Basis = Float[np.ndarray, "shots terms"]
+Magnitude = Float[np.ndarray, "3 rows columns"]
 
 
 @final
@@ -53,14 +55,14 @@ class Sources:
 @final
 @dataclass(frozen=True)
 class Windows:
-    """All shots about their LED.
+    """All shots about their LED, from which an image is solved in addition to diffraction, or a ``free`` one.
 
     Attributes:
         basis: polynomials at each shot's position.
         down, across: from nodes to samples, along columns and along rows: shift and disc.
         flux: light of each sample's own colour, 0 where nothing is known.
         channel: each sample's colour: 0, 1, 2 for R, G, B.
-        explained: light of each sample by diffraction, per unit of the LED's light.
+        explained: light of each sample by diffraction, per unit of the LED's light; 0 for a free image.
         rate: e-/s without background.
         left_out: standard deviation of the rate that a model error of 1 would add; see ``data.left_out``.
         weight: inverse variance of the rate that solutions use, 0 where nothing is known.
@@ -75,29 +77,44 @@ class Windows:
     rate: Float[np.ndarray, "shots rows columns"]
     left_out: Float[np.ndarray, "shots rows columns"]
     weight: Float[np.ndarray, "shots rows columns"]
+    free: bool
 
     def pick(self, keep: np.ndarray) -> Windows:
         """The shots selected by an index or mask."""
-        return Windows(*(part[keep] for part in vars(self).values()))
+        return replace(self, **{name: part[keep] for name, part in vars(self).items() if name != "free"})
 
-    def expected(self, free: bool, image: Image) -> Crops:
-        """Return each sample's light in e-/s, by an image, and by diffraction unless the image is ``free``."""
-        unit = predict(self, image) + (0.0 if free else self.explained)
-        return unit * self.flux
+    def unit_light(self, image: Image) -> Crops:
+        """Return each sample's light by an image, per unit of the LED's light."""
+        of_shots = np.tensordot(self.basis[:, : len(image)], image, 1)
+        moved = self.down[:, None] @ of_shots @ np.swapaxes(self.across, 1, 2)[:, None]
+        return np.take_along_axis(moved, self.channel[:, None], axis=1)[:, 0]
+
+    def by_colour(self, light: Crops) -> Float[np.ndarray, "shots 3 rows columns"]:
+        """Return the light on samples of each colour, 0 on the others."""
+        return light[:, None] * (self.channel[:, None] == np.arange(3)[:, None, None])
+
+    def gathered(self, light: Crops, terms: int) -> Image:
+        """Return the transpose of ``unit_light``."""
+        moved = np.swapaxes(self.down, 1, 2)[:, None] @ self.by_colour(light) @ self.across[:, None]
+        return np.tensordot(self.basis[:, :terms].T, moved, 1)
+
+    def smoothed(self, image: Image) -> Image:
+        """Smooth an image by a Gaussian of one node where it is free; the smoothing is its own transpose."""
+        if not self.free:
+            return image
+        return np.asarray(scipy.ndimage.gaussian_filter(image, 1.0, mode="constant", axes=(-2, -1)))
+
+    def expected(self, image: Image) -> Crops:
+        """Return each sample's light in e-/s, by an image and by diffraction."""
+        return (self.unit_light(image) + self.explained) * self.flux
 
 
 def make_windows(
-    shots: Shots,
-    sources: Sources,
-    explained: Crops,
-    basis: Float[np.ndarray, "shots terms"],
-    model_error: float,
-    per_px: int = 1,
+    shots: Shots, sources: Sources, explained: Crops, basis: Basis, model_error: float, free: bool = False
 ) -> Windows:
     """Return the data from which images are solved; see ``Windows``.
 
-    ``model_error``, relative to the peak, adds to the data's noise. The image has ``per_px`` nodes to a pixel, the
-    first and last on the first and last pixels.
+    ``model_error``, relative to the peak, adds to noise. First and last nodes are on the first and last pixels.
     """
     known, rate = shots.weight > 0, shots.rate - sources.background[:, None, None]
     flux = sources.flux[np.arange(shots.count)[:, None, None], shots.channel]
@@ -105,18 +122,17 @@ def make_windows(
     unexplained = left_out(smooth.reshape(shots.count, -1), 1.0).reshape(smooth.shape)
     measured = 1.0 / np.where(known, shots.weight, 1.0)
     variance = noise_at(smooth, rate, measured, shots.noise_per_rate) + (model_error * unexplained) ** 2
-    x, y = (sources.place_px - shots.origin_px).T
-    return Windows(
-        basis=basis,
-        down=shifts(y, shots.disc_px, shots.rate.shape[1], per_px),
-        across=shifts(x, shots.disc_px, shots.rate.shape[2], per_px),
-        flux=flux * known,
-        channel=shots.channel,
-        explained=explained,
-        rate=rate * known,
-        left_out=unexplained,
-        weight=np.where(known, 1.0 / variance, 0.0),
-    )
+    weight, explained = np.where(known, 1.0 / variance, 0.0), explained * (not free)
+    moves = _moves(shots, sources.place_px - shots.origin_px, free)
+    return Windows(basis, *moves, flux * known, shots.channel, explained, rate * known, unexplained, weight, free)
+
+
+def _moves(
+    shots: Shots, offset_px: Float[np.ndarray, "shots 2"], free: bool
+) -> tuple[Float[np.ndarray, "shots rows node_rows"], Float[np.ndarray, "shots columns node_columns"]]:
+    """Return ``Windows.down`` and ``Windows.across`` for LEDs at these offsets from the middle samples."""
+    (x, y), (rows, columns), per_px = offset_px.T, shots.rate.shape[1:], FREE_PER_PX if free else 1
+    return shifts(y, shots.disc_px, rows, per_px), shifts(x, shots.disc_px, columns, per_px)
 
 
 def shifts(
@@ -141,7 +157,7 @@ def shifts(
 
 
 def prior_sigma(
-    magnitude: Float[np.ndarray, "3 rows columns"], relative: float, per_px: int = 1
+    magnitude: Magnitude, relative: float, per_px: int = 1
 ) -> Float[np.ndarray, "3 node_rows node_columns"]:
     """Return the prior sigma of every coefficient: a fraction of the kernel's own size near that node."""
     near = scipy.ndimage.maximum_filter(scipy.ndimage.gaussian_filter(np.abs(magnitude), (0, 0.7, 0.7)), (1, 3, 3))
@@ -150,146 +166,109 @@ def prior_sigma(
     return np.asarray(relative * scipy.ndimage.zoom(near, nodes, order=1))
 
 
-def predict(windows: Windows, image: Image) -> Crops:
-    """Return each sample's light by an image, per unit of the LED's light."""
-    of_shots = np.tensordot(windows.basis[:, : len(image)], image, 1)
-    moved = windows.down[:, None] @ of_shots @ np.swapaxes(windows.across, 1, 2)[:, None]
-    return np.take_along_axis(moved, windows.channel[:, None], axis=1)[:, 0]
-
-
-def _by_colour(windows: Windows, light: Crops) -> Float[np.ndarray, "shots 3 rows columns"]:
-    return light[:, None] * (windows.channel[:, None] == np.arange(3)[:, None, None])
-
-
-def _gathered(windows: Windows, light: Crops, terms: int) -> Image:
-    """Return the transpose of ``predict``."""
-    moved = np.swapaxes(windows.down, 1, 2)[:, None] @ _by_colour(windows, light) @ windows.across[:, None]
-    return np.tensordot(windows.basis[:, :terms].T, moved, 1)
-
-
 @final
 @dataclass(frozen=True)
-class Moves:
-    """Changes of each shot along with a free image: place in px (x, y), and relative light (R, G, B).
+class Changes:
+    """Changes of each shot along with a free image: place in px (x, y), and relative light (R, G, B); or none.
 
-    ``design`` has the derivatives of samples, in e-/s; ``changed`` is the sum of the changes so far, and ``sigma`` the
+    ``design`` has the derivatives of samples, in e-/s; ``so_far`` is the sum of the changes so far, and ``sigma`` the
     prior standard deviations of the whole changes.
     """
 
-    design: Float[np.ndarray, "shots 5 rows columns"]
-    changed: Float[np.ndarray, "shots 5"]
-    sigma: Float[np.ndarray, "5"]
+    design: Float[np.ndarray, "shots own rows columns"]
+    so_far: Float[np.ndarray, "shots own"]
+    sigma: Float[np.ndarray, " own"]
 
-    def light(self, own: Float[np.ndarray, "shots 5"]) -> Crops:
+    @classmethod
+    def none(cls, shape: tuple[int, ...]) -> Changes:
+        """For shots x rows x columns whose place and light are known."""
+        return cls(np.zeros((shape[0], 0, *shape[1:])), np.zeros((shape[0], 0)), np.zeros(0))
+
+    def light(self, own: Float[np.ndarray, "shots own"]) -> Crops:
         """Return the light that changes add, in e-/s."""
         return np.einsum("spyx,sp->syx", self.design, own)
 
-    def fitted(self, light: Crops, weight: Crops) -> Float[np.ndarray, "shots 5"]:
+    def fitted(self, light: Crops, weight: Crops) -> Float[np.ndarray, "shots own"]:
         """Return the changes that this light is most likely to come from."""
-        weighted = (self.design * weight[:, None]).reshape(*self.design.shape[:2], -1)
+        weighted = (self.design * weight[:, None]).reshape(*self.design.shape[:2], light[0].size)
         flat = self.design.reshape(weighted.shape)
         normal = weighted @ np.swapaxes(flat, 1, 2) + np.diag(self.sigma**-2.0)
         return np.linalg.solve(normal, weighted @ light.reshape(len(light), -1, 1))[..., 0]
 
 
 def solve_image(
-    windows: Windows, sigma: Image, free: bool, start: Image, moves: Moves | None = None
-) -> tuple[Image, Float[np.ndarray, "shots 5"]]:
-    """Return the ridge estimate of an image, with diffraction or ``free`` of it, and the changes of own parameters.
+    windows: Windows, sigma: Image, start: Image, changes: Changes
+) -> tuple[Image, Float[np.ndarray, "shots own"]]:
+    """Return the ridge estimate of an image, and the changes of shots that are estimated along with it.
 
-    The image, like its ``start``, is in units of ``sigma``, its prior standard deviations; see ``image_of``. The prior
-    is about the addition to the start: a prior about the whole would prefer a smaller image and brighter LEDs. With
-    ``moves``, places and light of the shots are estimated too.
+    The image, like its ``start``, is in units of ``sigma``, its prior standard deviations, before it is smoothed. The
+    prior is about the addition to the start: a prior about the whole would prefer a smaller image and brighter LEDs.
     """
-    flux, weight, changes = windows.flux, windows.weight, np.zeros((len(windows.flux), 5))
-    data = windows.rate - (0.0 if free else flux * windows.explained)
+    flux, weight = windows.flux, windows.weight
     # The prior is about the whole change, and the model is linear: the data become those before any change.
-    data = data if moves is None else data + moves.light(moves.changed)
+    data = windows.rate - flux * windows.explained + changes.light(changes.so_far)
 
     def forward(scaled: Image) -> Crops:
-        return flux * predict(windows, image_of(scaled, sigma, free))
+        return flux * windows.unit_light(windows.smoothed(scaled * sigma))
 
     def backward(light: Crops) -> Image:
-        left = light if moves is None else light - moves.light(moves.fitted(light, weight))
-        return sigma * smoothed(_gathered(windows, flux * weight * left, len(sigma)), free)
+        left = light - changes.light(changes.fitted(light, weight))
+        return sigma * windows.smoothed(windows.gathered(flux * weight * left, len(sigma)))
 
     def normal(flat: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         return flat + backward(forward(flat.reshape(sigma.shape))).ravel()
 
-    iterations, tolerance = (150, 1e-5) if free else (60, 1e-4)
+    iterations, tolerance = (150, 1e-5) if windows.free else (60, 1e-4)
     operator = scipy.sparse.linalg.LinearOperator((sigma.size, sigma.size), matvec=normal, dtype=np.float64)
     # Pixels hardly share a residual's nodes: divided by the diagonal, bright nodes and dark ones converge alike, in few
     # iterations. A free image's are finer, and smoothed: it gains nothing.
     preconditioner = None
-    if not free:
+    if not windows.free:
         squared = replace(windows, basis=windows.basis**2, down=windows.down**2, across=windows.across**2)
-        diagonal = 1.0 + sigma**2 * _gathered(squared, flux**2 * weight, len(sigma))
+        diagonal = 1.0 + sigma**2 * squared.gathered(flux**2 * weight, len(sigma))
         preconditioner = scipy.sparse.diags_array(1.0 / diagonal.ravel())
     right = backward(data - forward(start)).ravel()
     added, _ = scipy.sparse.linalg.cg(operator, right, rtol=tolerance, maxiter=iterations, M=preconditioner)
     image = start + added.reshape(sigma.shape)
-    return image, changes if moves is None else moves.fitted(data - forward(image), weight)
+    return image, changes.fitted(data - forward(image), weight)
 
 
-def image_of(scaled: Image, sigma: Image, free: bool) -> Image:
-    """Return the image from its scaled values."""
-    return smoothed(scaled * sigma, free)
-
-
-def smoothed(image: Image, free: bool) -> Image:
-    """Smooth an image by a Gaussian of one node where it is free; the smoothing is its own transpose."""
-    if not free:
-        return image
-    return np.asarray(scipy.ndimage.gaussian_filter(image, 1.0, mode="constant", axes=(-2, -1)))
-
-
-def free_sources(
-    shots: Shots,
-    basis: Float[np.ndarray, "shots terms"],
-    terms: int,
-    magnitude: Float[np.ndarray, "3 rows columns"],
-    rules: PsfRules,
-) -> Sources:
+def free_sources(shots: Shots, basis: Basis, magnitude: Magnitude, rules: PsfRules) -> Sources:
     """Estimate places and light without diffraction: from the crops themselves, then along with a free image.
 
-    The image has the first ``terms`` of the ``basis``; ``magnitude`` is the kernel's average size.
+    The image is mixed by the ``basis``; ``magnitude`` is the kernel's average size.
     """
     colour = shots.colour * (shots.weight > 0)[..., None]
     light, covered = (np.einsum("syx,syxc->sc", shots.rate, colour), np.einsum("cyx,syxc->sc", magnitude, colour))
-    start = Sources(shots.centre_px, light / np.maximum(covered, 1e-6), np.zeros(shots.count))
-    nothing = np.zeros_like(shots.rate)
-    sigma = np.tile(prior_sigma(magnitude, 1.0, FREE_PER_PX), (terms, 1, 1, 1))
-    sources, changed, scaled = start, np.zeros((shots.count, 5)), np.zeros_like(sigma)
+    sources = start = Sources(shots.centre_px, light / np.maximum(covered, 1e-6), np.zeros(shots.count))
+    sigma = np.tile(prior_sigma(magnitude, 1.0, FREE_PER_PX), (basis.shape[1], 1, 1, 1))
+    scaled, so_far = np.zeros_like(sigma), np.zeros((shots.count, 5))
     for moving in (False, True, True):
-        windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
-        image = image_of(scaled, sigma, True)
-        moves = _moves(shots, sources, windows, image, changed, rules) if moving else None
-        scaled, found = solve_image(windows, sigma, True, scaled, moves)
-        # A change of the image has the same effect as a change common to the shots of a position.
-        mean = np.stack([found[shots.position == g].mean(axis=0) for g in range(shots.positions)])
-        # Places and light change by less than this (px; relative).
-        changed = np.clip(found - mean[shots.position], -0.7, 0.7)
-        sources = replace(start, place_px=start.place_px + changed[:, :2], flux=start.flux * (1.0 + changed[:, 2:]))
+        windows = make_windows(shots, sources, np.zeros_like(shots.rate), basis, rules.free_model_error, True)
+        changes = Changes.none(shots.rate.shape)
+        if moving:
+            design = _slopes(shots, sources, windows, windows.smoothed(scaled * sigma))
+            changes = Changes(design, so_far, np.repeat(rules.own_sigma, (2, 3)))
+        scaled, found = solve_image(windows, sigma, scaled, changes)
+        if moving:
+            # A change of the image has the same effect as a change common to the shots of a position.
+            mean = np.stack([found[shots.position == g].mean(axis=0) for g in range(shots.positions)])
+            # Places and light change by less than this (px; relative).
+            so_far = np.clip(found - mean[shots.position], -0.7, 0.7)
+            sources = replace(start, place_px=start.place_px + so_far[:, :2], flux=start.flux * (1.0 + so_far[:, 2:]))
     return sources
 
 
-def _moves(
-    shots: Shots,
-    sources: Sources,
-    windows: Windows,
-    image: Image,
-    changed: Float[np.ndarray, "shots 5"],
-    rules: PsfRules,
-) -> Moves:
-    """Linearise about ``sources``, whose places and light have already changed by ``changed``."""
-    x, y = (sources.place_px - shots.origin_px).T
+def _slopes(
+    shots: Shots, sources: Sources, windows: Windows, image: Image
+) -> Float[np.ndarray, "shots own rows columns"]:
+    """Return derivatives of samples, in e-/s, by their LED's place in px (x, y) and relative light (R, G, B)."""
+    offset_px = sources.place_px - shots.origin_px
 
     def at(right: float, below: float) -> Crops:
-        down = shifts(y + below, shots.disc_px, shots.rate.shape[1], FREE_PER_PX)
-        across = shifts(x + right, shots.disc_px, shots.rate.shape[2], FREE_PER_PX)
-        return predict(replace(windows, down=down, across=across), image)
+        down, across = _moves(shots, np.add(offset_px, (right, below)), True)
+        return replace(windows, down=down, across=across).unit_light(image)
 
     h = 0.05
     by_place = [(at(h, 0.0) - at(-h, 0.0)) / (2 * h), (at(0.0, h) - at(0.0, -h)) / (2 * h)]
-    design = np.concatenate([np.stack(by_place, 1), _by_colour(windows, at(0.0, 0.0))], 1) * windows.flux[:, None]
-    return Moves(design, changed, np.repeat(rules.own_sigma, (2, 3)))
+    return np.concatenate([np.stack(by_place, 1), windows.by_colour(at(0.0, 0.0))], 1) * windows.flux[:, None]

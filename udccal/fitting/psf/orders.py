@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.orders import Attempt, Choice, choose, held_out_beats, rising
 from udccal.fitting.psf.data import (
-    HUBER,
     Crops,
     PsfRules,
     Shots,
     about_middle,
-    estimate_model_error,
     held_out_positions,
-    noise_at,
 )
+from udccal.fitting.psf.held_out import Compared, compare
 from udccal.fitting.psf.image import (
     FREE_PER_PX,
+    Basis,
+    Changes,
     Image,
+    Magnitude,
     Sources,
     Windows,
     free_sources,
-    image_of,
     make_windows,
     prior_sigma,
     solve_image,
@@ -35,67 +34,7 @@ from udccal.fitting.psf.image import (
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.result import Candidate
 
-
-@final
-@dataclass(frozen=True)
-class Compared:
-    """Samples that a solution has not used, and its expectation of them.
-
-    Attributes:
-        residual, light: in e-/s.
-        measured, variance: variance of the sensor's noise, as measured, and at the expected light.
-        left_out: standard deviation that a model error of 1 would add.
-        known: True for samples that were measured.
-        channel: each sample's colour; flux: the LED's light in that colour, in e-/s.
-        model_error: the one of greatest likelihood for the residuals.
-    """
-
-    residual: Crops
-    light: Crops
-    measured: Crops
-    variance: Crops
-    left_out: Crops
-    known: Bool[np.ndarray, "shots rows columns"]
-    channel: Int[np.ndarray, "shots rows columns"]
-    flux: Crops
-    model_error: float
-
-    @property
-    def total(self) -> Crops:
-        """Variance of samples, with the model error."""
-        return self.variance + (self.model_error * self.left_out) ** 2
-
-    def errors(self) -> Float[np.ndarray, " samples"]:
-        """Errors of all samples, in units of their sigma."""
-        return (self.residual / np.sqrt(self.total))[self.known]
-
-    def relative_l2(self) -> Float[np.ndarray, "3"]:
-        """Return the expectation's error by colour, which includes the data's own noise."""
-        channel = self.channel[self.known]
-        error, light = (np.bincount(channel, part[self.known] ** 2, 3) for part in (self.residual, self.light))
-        return np.sqrt(error / np.maximum(light, 1e-30))
-
-    def loss(self, position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
-        """Return minus twice the log likelihood per sample, up to a constant, by position.
-
-        The model's deviation is common to the pictures of a position. For a single position, the loss is by picture.
-        """
-        each = (np.log(self.total / self.measured) + HUBER.loss(self.residual / np.sqrt(self.total))) * self.known
-        by_shot = each.sum(axis=(1, 2)) / np.maximum(self.known.sum(axis=(1, 2)), 1)
-        places = np.unique(position)
-        return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot
-
-
-def compare(shots: Shots, windows: Windows, light: Crops) -> Compared:
-    """Compare the shots with the ``light`` (e-/s) that is expected of them."""
-    known, residual = shots.weight > 0, windows.rate - light
-    measured = 1.0 / np.where(known, shots.weight, 1.0)
-    variance = noise_at(light, windows.rate, measured, shots.noise_per_rate)
-    # All orders have the same deviation here; it is above 0 where one of them expects no light.
-    model_error = estimate_model_error(residual[known], variance[known], windows.left_out[known], 0)
-    return Compared(
-        residual, light, measured, variance, windows.left_out, known, windows.channel, windows.flux, model_error
-    )
+Places = Float[np.ndarray, "positions 2"]
 
 
 @final
@@ -118,11 +57,6 @@ class Order:
     reach: float = 1.0
 
     @property
-    def per_px(self) -> int:
-        """Number of the image's nodes per pixel."""
-        return FREE_PER_PX if self.free else 1
-
-    @property
     def name(self) -> str:
         """Name in the table of candidates."""
         if self.degree < 0:
@@ -132,14 +66,15 @@ class Order:
         within = "" if self.reach == 1 else f" within {self.reach:g} of the window"
         return f"diffraction, residual degree {self.degree} of {100 * self.size:g} %{within}"
 
-    def half_px(self, half: tuple[int, int]) -> tuple[int, int]:
-        """Return (rows, columns) to either side of the source that have a residual, in windows of this size."""
-        return round(self.reach * half[0]), round(self.reach * half[1])
+    @property
+    def per_px(self) -> int:
+        """Number of the image's nodes per pixel."""
+        return FREE_PER_PX if self.free else 1
 
-    def coefficients(self, half: tuple[int, int]) -> int:
-        """Return the number of the image's coefficients for windows of this size."""
-        rows, columns = (2 * self.per_px * size + 1 for size in self.half_px(half))
-        return 3 * rows * columns * polynomial_terms(self.degree)
+    def half(self, shots: Shots) -> tuple[int, int]:
+        """Return (rows, columns) to either side of the source that have a residual, in pixels of these windows."""
+        rows, columns = (round(self.reach * size) for size in shots.half)
+        return rows, columns
 
 
 @final
@@ -179,8 +114,8 @@ class _Orders:
 
     shots: Shots
     explained: Crops
-    basis: Float[np.ndarray, "shots terms"]
-    magnitude: Float[np.ndarray, "3 rows columns"]
+    basis: Basis
+    magnitude: Magnitude
     test: Bool[np.ndarray, " shots"]
     rules: PsfRules
 
@@ -188,36 +123,37 @@ class _Orders:
         """Solve from all shots but those held out, and compare with these."""
         found = self.compared(sources, order, self.test)
         trial = Trial(order, sources, found, found.loss(self.shots.position[self.test]))
-        return Attempt(order.name, order.coefficients(self.shots.half), float(trial.loss.mean()), trial)
+        rows, columns = (2 * order.per_px * size + 1 for size in order.half(self.shots))
+        coefficients = 3 * rows * columns * polynomial_terms(order.degree)
+        return Attempt(order.name, coefficients, float(trial.loss.mean()), trial)
 
     def compared(self, sources: Sources, order: Order, unseen: Bool[np.ndarray, " shots"]) -> Compared:
         """Solve from all shots but the ``unseen``, and compare with these."""
         windows = self._windows(sources, order)
-        light = windows.pick(unseen).expected(order.free, self._solve(windows.pick(~unseen), order))
+        light = windows.pick(unseen).expected(self._solve(windows.pick(~unseen), order))
         return compare(self.shots.pick(unseen), windows.pick(unseen), light)
 
-    def image(self, trial: Trial) -> Float[np.ndarray, "terms 3 rows columns"]:
-        """Solve for the residual from all shots."""
+    def image(self, trial: Trial) -> Image:
+        """Solve for the residual on pixels from all shots."""
         order = trial.order
         if order.degree < 0:
             return np.zeros((1, 3, 1, 1))
         image = self._solve(self._windows(trial.sources, order), order)[..., :: order.per_px, :: order.per_px]
-        return about_middle(image, order.half_px(self.shots.half))
+        return about_middle(image, order.half(self.shots))
 
-    def rising(
-        self, sources: Sources, free: bool, sizes: Sequence[float], allowed: float
-    ) -> tuple[Attempt[Trial], ...]:
+    def rising(self, sources: Sources, free: bool, allowed: float) -> tuple[Attempt[Trial], ...]:
         """Try rising degrees while they help, each with its best size; see ``engine.orders.rising``.
 
         There are never more terms than fitted positions. A degree's residuals give the next one's model error.
         """
         positions = len(np.unique(self.shots.position[~self.test]))
-        allowances = [allowed]
+        sizes = (1.0,) if free else self.rules.residual_sizes
 
         def attempt(degree: int) -> Attempt[Trial]:
-            orders = (Order(degree, free, size, allowances[-1]) for size in (sizes if degree >= 0 else (0.0,)))
-            best = choose(self.attempt(sources, order) for order in orders).best
-            allowances.append(best.fit.compared.model_error)
+            nonlocal allowed
+            orders = [Order(degree, free, size, allowed) for size in (sizes if degree >= 0 else (0.0,))]
+            best = choose([self.attempt(sources, order) for order in orders]).best
+            allowed = best.fit.compared.model_error
             return best
 
         degrees = range(0 if free else -1, self.rules.highest_degree + 1)
@@ -237,47 +173,46 @@ class _Orders:
         return (*tried, best)
 
     def _windows(self, sources: Sources, order: Order) -> Windows:
-        return make_windows(self.shots, sources, self.explained, self.basis, order.model_error, order.per_px)
+        return make_windows(self.shots, sources, self.explained, self.basis, order.model_error, order.free)
 
     def _solve(self, windows: Windows, order: Order) -> Image:
         """Solve for the residual's image, which is 0 beyond its reach."""
         sigma = prior_sigma(self.magnitude, order.size, order.per_px)
         y, x = (np.abs(np.arange(nodes) - nodes // 2) for nodes in sigma.shape[1:])
-        rows, columns = (order.per_px * half for half in order.half_px(self.shots.half))
+        rows, columns = (order.per_px * half for half in order.half(self.shots))
         within = sigma * ((y <= rows)[:, None] & (x <= columns))
         sigmas = np.tile(within, (polynomial_terms(order.degree), 1, 1, 1))
         if order.degree < 0:
             return sigmas
-        return image_of(solve_image(windows, sigmas, order.free, np.zeros_like(sigmas))[0], sigmas, order.free)
+        scaled, _ = solve_image(windows, sigmas, np.zeros_like(sigmas), Changes.none(windows.rate.shape))
+        return windows.smoothed(scaled * sigmas)
 
 
 def select_field(
-    shots: Shots,
-    sources: Sources,
-    explained: Crops,
-    unit_positions: Float[np.ndarray, "positions 2"],
-    model_error: float,
-    rules: PsfRules,
+    shots: Shots, sources: Sources, explained: Crops, unit_positions: Places, model_error: float, rules: PsfRules
 ) -> Selection:
     """Try no residual, then residuals of rising degree while they help; if diffraction fails, do without it.
 
     ``sources``, ``explained`` (light per unit) and ``model_error`` are those of diffraction; ``unit_positions`` are the
     field positions, scaled to about [-1, 1].
     """
-    magnitude = _mean_kernel(shots, sources)
+    # The kernel's average size by colour, on samples that any picture has.
+    colour = shots.colour * (shots.weight > 0)[..., None]
+    rate = np.abs(shots.rate - sources.background[:, None, None])
+    seen = np.maximum(colour.sum(axis=0), 1.0).transpose(2, 0, 1)
+    magnitude = np.einsum("syx,syxc->cyx", rate, colour) / seen
+    magnitude /= np.maximum(magnitude.sum(axis=(1, 2), keepdims=True), 1e-30)
     test = held_out_positions(shots.positions)[shots.position]
     basis = np.asarray(polynomial_basis(unit_positions, rules.highest_degree))[shots.position]
     orders = _Orders(shots, explained, basis, magnitude, test, rules)
-    tried = orders.rising(sources, False, rules.residual_sizes, model_error)
+    tried = orders.rising(sources, False, model_error)
     if np.sqrt((tried[0].fit.compared.relative_l2() ** 2).mean()) > rules.doubtful:
         # Places and light by an image of too low a degree take a part of what it lacks.
         terms = [polynomial_terms(degree) for degree in range(rules.highest_degree + 1)]
         most = max(count for count in terms if 2 * count <= max(shots.positions, 2))
-        free = free_sources(shots, basis, most, magnitude, rules)
-        tried += orders.rising(free, True, (1.0,), rules.free_model_error)
-    best = tried[0]
-    for attempt in tried[1:]:
-        best = attempt if orders.beats(attempt, best) else best
+        free = free_sources(shots, basis[:, :most], magnitude, rules)
+        tried += orders.rising(free, True, rules.free_model_error)
+    best = reduce(lambda best, one: one if orders.beats(one, best) else best, tried)
     if best.fit.order.degree >= 0 and not best.fit.order.free:
         narrower = orders.narrowed(best)
         tried, best = (*tried, *(one for one in narrower if one is not best)), narrower[-1]
@@ -286,12 +221,3 @@ def select_field(
         # Diffraction has few parameters: the shots that it was fitted to show its error as well as others do.
         everywhere = orders.compared(best.fit.sources, best.fit.order, np.ones_like(test))
     return Selection(best.fit, Choice(best, tried).candidates, orders.image(best.fit), magnitude, everywhere)
-
-
-def _mean_kernel(shots: Shots, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:
-    """Return the kernel's average size by colour, on samples that any picture has."""
-    colour = shots.colour * (shots.weight > 0)[..., None]
-    rate = np.abs(shots.rate - sources.background[:, None, None])
-    seen = np.maximum(colour.sum(axis=0), 1.0).transpose(2, 0, 1)
-    kernel = np.einsum("syx,syxc->cyx", rate, colour) / seen
-    return kernel / np.maximum(kernel.sum(axis=(1, 2), keepdims=True), 1e-30)

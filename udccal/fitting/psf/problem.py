@@ -21,30 +21,17 @@ from udccal.fitting.psf.kernel import (
     BLUR,
     FOOTPRINT,
     HEAD,
+    OWN,
     PITCH,
     PUPIL,
     Evaluator,
-    fit_lattice,
-    kernel_coefficients,
-    kernel_jacobian,
-    overlaps_of,
-)
-from udccal.fitting.psf.samples import (
-    OWN,
+    Kernel,
     Light,
-    Lights,
     Own,
-    Owns,
     Samples,
     Theta,
-    flux_of,
+    fit_lattice,
     gather,
-    huber_weight,
-    own_slopes,
-    sampled,
-    start_own,
-    unit_light,
-    weighed,
 )
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_two_threads
@@ -64,10 +51,15 @@ class Place:
     """
 
     theta: Float[np.ndarray, " p"]
-    own: Owns
-    light: Lights
+    own: Own
+    light: Light
     by_theta: Float[np.ndarray, "positions shots n p"]
     by_own: Float[np.ndarray, "positions shots n l"]
+
+    @property
+    def level(self) -> Light:
+        """The samples' light and background."""
+        return self.light + self.own[..., 5:]
 
 
 @final
@@ -96,23 +88,30 @@ class DiffractionProblem:
         """Number of parameters, those of each shot included."""
         return self.prior.mean.size + OWN * int((self.samples.index >= 0).sum())
 
-    def at(self, theta: Theta, own: Owns, near: Place | None = None) -> Place:
+    def at(self, theta: Theta, own: Own, near: Place | None = None) -> Place:
         """Return the place of these parameters, with the derivatives of a place ``near`` it, or with its own."""
 
         def lit(part: tuple[Samples, Own]) -> tuple[np.ndarray, ...]:
-            return _lit(self.evaluator, theta, *part, near is None)
+            one, own = part
+            kernel = kernel_of(self.evaluator, theta, one)
+            here = one.unit_light(kernel, own[:, :2])
+            # A shot's own place and the overlaps change the light to first order.
+            changed = one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
+            light = (here + changed) * one.flux(own)
+            if near is not None:
+                return (light,)
+            return light, _slopes(self.evaluator, theta, one, own), one.own_slopes(own, kernel, here, changed)
 
-        parts = in_two_threads(lit, zip(self.samples.each(), own, strict=True))
-        light, *derivatives = (np.stack(one) for one in zip(*parts, strict=True))
+        made = in_two_threads(lit, zip(self.samples.each(), own, strict=True))
+        light, *derivatives = (np.stack(one) for one in zip(*made, strict=True))
         if near is not None:
             derivatives = [near.by_theta, near.by_own]
         return Place(theta, own, light, *derivatives)
 
     def by_position(self, place: Place) -> list[Blocks]:
         """Return each position's part of the Gauss-Newton equations with Huber's weights, without the prior."""
-        weight, residual = self.samples.weight, self.samples.rate - place.light - place.own[..., 5:]
-        losses = HUBER.loss(residual * np.sqrt(weight))
-        huber, made = huber_weight(residual, weight), []
+        weight, residual, made = self.samples.weight, self.samples.rate - place.level, []
+        losses, huber = HUBER.loss(residual * np.sqrt(weight)), _huber_weight(residual, weight)
         for i, (by_theta, by_own) in enumerate(zip(place.by_theta, place.by_own, strict=True)):
             weighted, across = by_theta * huber[i, ..., None], np.swapaxes(by_own * huber[i, ..., None], 1, 2)
             flat = by_theta.reshape(-1, by_theta.shape[-1])
@@ -134,53 +133,27 @@ class DiffractionProblem:
 
     def moved(self, place: Place, step: Step) -> Place:
         """Return the place after a step."""
-        theta, own = stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape))
+        theta, own = stepped(place.theta, step.shared), _moved_own(place.own, step.own.reshape(place.own.shape))
         # The gain is the square of the step's length in sigmas: derivatives hardly change over five of them.
         return self.at(theta, own, place if step.gain < 25.0 else None)
 
-    def light_of_average(self, place: Place) -> Lights:
-        """Return the light averaged over the footprint's place, without interference."""
-        samples = self.samples
-        none = {name: np.zeros_like(getattr(samples, name)) for name in ("overlaps", "correction", "by_overlaps")}
-        return replace(self, samples=replace(samples, **none)).at(place.theta, place.own, place).light
-
-    def errors(self, place: Place) -> Lights:
+    def errors(self, place: Place) -> Light:
         """Return data less expectation in units of sigma, 0 for unused samples."""
-        return (self.samples.rate - place.light - place.own[..., 5:]) * np.sqrt(self.samples.weight)
+        return (self.samples.rate - place.level) * np.sqrt(self.samples.weight)
 
     def with_overlaps(self, theta: Float[np.ndarray, " p"]) -> DiffractionProblem:
         """Set the overlaps to those of ``theta``: they hardly change in a descent."""
-
-        def overlaps(one: Samples) -> np.ndarray:
-            return np.asarray(overlaps_of(self.evaluator, theta, one.frame))
-
-        found = in_two_threads(overlaps, self.samples.each())
+        found = in_two_threads(lambda one: np.asarray(self.evaluator.overlaps(theta, one.frame)), self.samples.each())
         return replace(self, samples=replace(self.samples, overlaps=np.stack(found)))
 
-    def about(self, theta: Theta, own: Owns, near: bool = False) -> DiffractionProblem:
+    def about(self, theta: Theta, own: Own, near: bool = False) -> DiffractionProblem:
         """Set interference up about these parameters; ``near`` the last ones, derivatives by overlaps stay."""
+        problem = self.with_overlaps(theta)
         if not self.evaluator.interference:
-            return self.with_overlaps(theta)
-
-        def set_up(part: tuple[Samples, Own]) -> Samples:
-            return _set_up(self.evaluator, theta, *part, near)
-
-        made = in_two_threads(set_up, zip(self.samples.each(), own[..., :2], strict=True))
+            return problem
+        parts = zip(problem.samples.each(), own[..., :2], strict=True)
+        made = in_two_threads(lambda part: _set_up(self.evaluator, theta, *part, near), parts)
         return replace(self, samples=jax.tree.map(lambda *parts: np.stack(parts), *made))
-
-
-def _lit(evaluator: Evaluator, theta: Theta, one: Samples, own: Own, with_slopes: bool) -> tuple[np.ndarray, ...]:
-    """Return the light of one position's samples, and its derivatives by shared and own parameters if wanted.
-
-    A shot's own place and the overlaps change the light to first order.
-    """
-    kernel = kernel_of(evaluator, theta, one)
-    here = unit_light(evaluator, one, own[:, :2], kernel)
-    changed = one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
-    light = (here + changed) * flux_of(one, own)
-    if not with_slopes:
-        return (light,)
-    return light, slopes(evaluator, theta, one, own), own_slopes(evaluator, one, own, kernel, here, changed)
 
 
 def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
@@ -188,8 +161,7 @@ def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Fl
 
     Lengths and openings stay positive: they at most halve, or double.
     """
-    spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
-    logs = step[HEAD:].reshape(3, -1)
+    spectra, logs = softmax(theta[HEAD:].reshape(3, -1), axis=1), step[HEAD:].reshape(3, -1)
     mean = np.sum(spectra * logs, axis=1, keepdims=True)
     grown = logs - mean
     grown = np.where(grown > 0, np.log1p(np.maximum(grown, 0.0)), grown)
@@ -198,26 +170,47 @@ def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Fl
     return moved
 
 
-def moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -> Float[np.ndarray, "*k l"]:
+def _moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -> Float[np.ndarray, "*k l"]:
     """Return own parameters after a step; places of LEDs move by half a pixel at most."""
     return own + np.concatenate([np.clip(step[..., :2], -0.5, 0.5), step[..., 2:]], axis=-1)
 
 
-def kernel_of(evaluator: Evaluator, theta: Theta, one: Samples) -> Float[np.ndarray, "y x 3"]:
+def _huber_weight(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return weights of squared residuals in a step, those of Huber's loss."""
+    return np.asarray(weight * np.minimum(1.0, HUBER.sigma / np.maximum(np.abs(residual) * np.sqrt(weight), 1e-12)))
+
+
+def kernel_of(evaluator: Evaluator, theta: Float[np.ndarray, " p"], one: Samples) -> Kernel:
     """Return the kernel's spline coefficients at one position."""
-    return np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, one.overlaps))
+    return np.asarray(evaluator.kernel(theta, one.frame, one.disc_px, one.overlaps))
+
+
+def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float[np.ndarray, "shots n p"]:
+    """Return derivatives of the light of one position's samples by the shared parameters."""
+    spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
+    # Single precision takes less time, and its errors are a millionth of a derivative.
+    with jax.enable_x64(False):
+        made = evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps)
+        coefficients, chain = (np.asarray(part) for part in made)
+    nodes, by_factor = np.split(one.sampled(coefficients, own[:, :2]), [spectra.shape[1]], axis=-1)
+    of_colour = one.colour @ spectra
+    unit = np.einsum("snj,snj->sn", nodes, of_colour)
+    of_own = by_factor.reshape(*unit.shape, -1, 3) * one.colour[:, :, None]
+    by_head = of_own.reshape(*unit.shape, -1) @ chain.reshape(-1, chain.shape[-1])
+    by_head[..., _IN_OVERLAPS] += one.by_overlaps
+    by_logs = one.colour[..., None] * (of_colour * (nodes - unit[..., None]))[..., None, :]
+    return np.concatenate([by_head, by_logs.reshape(*unit.shape, -1)], axis=-1) * one.flux(own)[..., None]
 
 
 def _set_up(
     evaluator: Evaluator, theta: Theta, one: Samples, offset_px: Float[np.ndarray, "shots 2"], near: bool
 ) -> Samples:
     """Return one position's samples with interference set up about these parameters; see ``Samples``."""
-    one = replace(one, overlaps=np.asarray(overlaps_of(evaluator, theta, one.frame)), overlaps_at=theta[_IN_OVERLAPS])
 
-    def light(theta: Theta, overlaps: np.ndarray) -> Light:
-        return unit_light(evaluator, one, offset_px, kernel_of(evaluator, theta, replace(one, overlaps=overlaps)))
+    def light(theta: Theta, overlaps: np.ndarray = one.overlaps) -> Light:
+        return one.unit_light(kernel_of(evaluator, theta, replace(one, overlaps=overlaps)), offset_px)
 
-    here = light(theta, one.overlaps)
+    here = light(theta)
     # The pupil's footprint moves with a shot's own place.
     slope = one.frame.direction[:2] / one.frame.direction[2]
     tangent = (np.eye(2) + np.outer(slope, slope)) / one.frame.direction[2]
@@ -226,36 +219,48 @@ def _set_up(
     for shot, move in enumerate(along):
         elsewhere = theta.copy()
         elsewhere[FOOTPRINT][:2] += move
-        correction[shot] = (light(elsewhere, one.overlaps) - here)[shot]
+        correction[shot] = (light(elsewhere) - here)[shot]
+    one = replace(one, overlaps_at=theta[_IN_OVERLAPS], correction=correction)
     if near:
-        return replace(one, correction=correction)
+        return one
     # Overlaps are in single precision: steps of this length (mm) keep their difference precise. Steps ten times as
     # long change derivatives by some per cent.
     by_overlaps = []
     for i, step in zip(_IN_OVERLAPS, (2e-4, 1e-3), strict=True):
-        moved = np.asarray(overlaps_of(evaluator, theta + step * np.eye(theta.size)[i], one.frame))
+        moved = np.asarray(evaluator.overlaps(theta + step * np.eye(theta.size)[i], one.frame))
         by_overlaps.append((light(theta, moved) - here) / step)
-    return replace(one, correction=correction, by_overlaps=np.stack(by_overlaps, axis=-1))
+    return replace(one, by_overlaps=np.stack(by_overlaps, axis=-1))
 
 
-def slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float[np.ndarray, "shots n p"]:
-    """Return derivatives of the light of one position's samples by the shared parameters."""
-    spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
-    # Single precision takes less time, and its errors are a millionth of a derivative.
-    with jax.enable_x64(False):
-        made = kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps)
-        coefficients, chain = (np.asarray(part) for part in made)
-    count = spectra.shape[1]
-    values = sampled(evaluator, one, coefficients, own[:, :2])
-    nodes, by_colour = values[..., :count], values[..., count:].reshape(*values.shape[:2], -1, 3)
-    of_colour = one.colour @ spectra
-    unit = np.einsum("snj,snj->sn", nodes, of_colour)
-    of_own = by_colour * one.colour[:, :, None]
-    by_head = of_own.reshape(*unit.shape, -1) @ chain.reshape(-1, chain.shape[-1])
-    by_head[..., _IN_OVERLAPS] += one.by_overlaps
-    by_logs = one.colour[..., None] * (of_colour * (nodes - unit[..., None]))[..., None, :]
-    by_theta = np.concatenate([by_head, by_logs.reshape(*unit.shape, -1)], axis=-1)
-    return by_theta * flux_of(one, own)[..., None]
+def start_own(one: Samples, kernel: Kernel) -> Own:
+    """Start own parameters of one position's shots: the best of a grid of places, light and background linear in it.
+
+    A centroid is not accurate enough. Neighbouring diffraction orders are half as bright as the middle one, and the
+    mosaic samples each colour unevenly: it can be off by a pixel, and a descent then ends on a neighbouring order.
+    """
+    moves = np.stack(np.meshgrid(*2 * (np.linspace(-1.25, 1.25, 11),)), axis=-1).reshape(-1, 1, 2)
+    moves = np.repeat(moves, len(one.rate), axis=1)
+    # Places are compared on the samples about the brightest spot; 117 of them are enough.
+    near = one.nearest(117)
+    offset = moves[_linear(near, near.unit_light(kernel, moves))[1].argmin(axis=0), 0]
+    light, _ = _linear(one, one.unit_light(kernel, offset)[None])
+    return np.concatenate([offset, light[0]], axis=-1)
+
+
+def _linear(
+    one: Samples, units: Float[np.ndarray, "moves shots n"]
+) -> tuple[Float[np.ndarray, "moves shots 4"], Float[np.ndarray, "moves shots"]]:
+    """Fit light per colour and background of the shots for each of several expectations; return them and the cost."""
+    seen = one.weight > 0
+    # Far from the solution, the model error is a tenth of the signal or more.
+    variance = 1.0 / np.where(seen, one.weight, 1.0) + (0.1 * np.maximum(one.rate, 0.0)) ** 2
+    root = np.where(seen, 1.0 / np.sqrt(variance), 0.0)
+    design = np.concatenate([units[..., None] * one.colour, np.ones((*units.shape, 1))], axis=-1) * root[..., None]
+    data, across = (one.rate * root)[..., None], np.swapaxes(design, -1, -2)
+    solution = scaled_inverse(across @ design) @ (across @ data)
+    # Without the bound a place where nothing is expected would fit a dark neighbourhood best.
+    left = np.minimum(np.abs(data - design @ solution), 10.0)
+    return solution[..., 0], (left[..., 0] ** 2).sum(axis=-1)
 
 
 def explain(
@@ -263,21 +268,21 @@ def explain(
 ) -> tuple[Sources, Crops]:
     """Apply diffraction to whole crops: return place and light of the LEDs, and the samples' light per unit."""
     evaluator = replace(evaluator, lattice=fit_lattice(shots.half))
-    samples = weighed(gather(shots, geometry, np.ones(shots.rate.shape, dtype=bool)), model_error)
+    samples = gather(shots, geometry, np.ones(shots.rate.shape, dtype=bool)).weighed(model_error)
     found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)
 
     def fitted(one: Samples) -> tuple[Own, Light]:
-        overlaps = np.asarray(overlaps_of(evaluator, theta, one.frame))
-        kernel = kernel_of(evaluator, theta, replace(one, overlaps=overlaps))
-        own = start_own(evaluator, one, kernel)
+        one = replace(one, overlaps=np.asarray(evaluator.overlaps(theta, one.frame)))
+        kernel = kernel_of(evaluator, theta, one)
+        own = start_own(one, kernel)
         for _ in range(3):
-            unit = unit_light(evaluator, one, own[:, :2], kernel)
-            by_own = own_slopes(evaluator, one, own, kernel, unit)
-            residual = one.rate - unit * flux_of(one, own) - own[:, 5:]
-            across = np.swapaxes(by_own * huber_weight(residual, one.weight)[..., None], 1, 2)
+            unit = one.unit_light(kernel, own[:, :2])
+            by_own = one.own_slopes(own, kernel, unit)
+            residual = one.rate - unit * one.flux(own) - own[:, 5:]
+            across = np.swapaxes(by_own * _huber_weight(residual, one.weight)[..., None], 1, 2)
             step = scaled_inverse(across @ by_own, 1e-14) @ (across @ residual[..., None])
-            own = moved_own(own, step[..., 0])
-        return own, unit_light(evaluator, one, own[:, :2], kernel)
+            own = _moved_own(own, step[..., 0])
+        return own, one.unit_light(kernel, own[:, :2])
 
     for index, (own, unit) in zip(samples.index, in_two_threads(fitted, samples.each()), strict=True):
         real = index >= 0

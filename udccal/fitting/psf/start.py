@@ -1,20 +1,30 @@
-"""Reads a session's LED pictures: brackets merged, crops cut about the LED, the wire divided out."""
+"""What a fit starts from: crops read from a session, which of them it looks at, and start and prior of diffraction.
+
+Of a session's LED pictures, brackets are merged, crops cut about the LED, and the wire divided out.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Final
 
+import jax
 import numpy as np
 import scipy.ndimage
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from udccal.cfa import cfa_named
+from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.hdr.merge import HdrMerge, merge_bracket
-from udccal.fitting.psf.data import PsfData, PsfRules, Shots, joined
+from udccal.fitting.psf.data import PsfData, PsfRules, Shots, held_out_positions, joined
+from udccal.fitting.psf.kernel import HEAD, WAVELENGTHS_NM
 from udccal.kernels import kernel_size
+from udccal.models.diffraction import Diffraction
+from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
+from udccal.models.wire import Wire
 from udccal.result import FitStatus
+from udccal.rig import RigDescription
 from udccal.sessions.schema import LedSubject, StoredStep
 from udccal.sessions.store import Session
 
@@ -68,11 +78,10 @@ def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
 
 def _without_wire(shots: Shots, wire_map: Float[np.ndarray, "rows columns"]) -> Shots:
     """Divide rates by the wire; samples beyond the sensor have no weight."""
-    x, y = np.moveaxis(shots.offsets()[None] + shots.origin_px[:, None, None], -1, 0)
+    x, y = np.moveaxis(shots.offsets() + shots.origin_px[:, None, None], -1, 0)
     gain = wire_map[np.clip(y, 0, wire_map.shape[0] - 1), np.clip(x, 0, wire_map.shape[1] - 1)]
-    return replace(
-        shots, rate=shots.rate / gain, weight=shots.weight * gain**2, noise_per_rate=shots.noise_per_rate / gain
-    )
+    rate, slope = shots.rate / gain, shots.noise_per_rate / gain
+    return replace(shots, rate=rate, weight=shots.weight * gain**2, noise_per_rate=slope)
 
 
 def _read_shot(
@@ -123,10 +132,9 @@ def cut_crop(
     weight. The aim is on the sensor; ``disc_px`` is the diameter of the LED's image. Without ``noise_per_rate`` (see
     ``shot_noise``) the merged sigma stays unchanged.
     """
-    rate = merged.rate_e_per_s
+    rate, known = merged.rate_e_per_s, merged.used > 0
     # Rounding moves the faintest samples alike: thousands of them would outvote the kernel's bright part. The mean of
     # neighbours chooses them, so that a sample's own noise does not.
-    known = merged.used > 0
     if merged.rounded_below > 0:
         known &= scipy.ndimage.uniform_filter(rate, 3) >= merged.rounded_below
     weight = np.where(known, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
@@ -134,12 +142,10 @@ def cut_crop(
     if place is None:
         return None
     x, y = middle = np.round(place).astype(np.int64)
-    slope = np.zeros_like(rate) if noise_per_rate is None else noise_per_rate
-    parts = (
-        np.pad(part, [2 * (h,) for h in half])
-        for part in (rate, weight, cfa_named(cfa).channel_map(*rate.shape), slope)
-    )
-    windows = (part[None, y : y + 2 * half[0] + 1, x : x + 2 * half[1] + 1] for part in parts)
+    slope = 0.0 if noise_per_rate is None else noise_per_rate
+    parts = np.broadcast_arrays(rate, weight, cfa_named(cfa).channel_map(*rate.shape), slope)
+    padded = (np.pad(part, [2 * (h,) for h in half]) for part in parts)
+    windows = (part[None, y : y + 2 * half[0] + 1, x : x + 2 * half[1] + 1] for part in padded)
     where = (place + corner_px)[None], (middle + corner_px)[None], np.zeros(1, dtype=np.int64), np.array([disc_px])
     return Shots(*where, *windows)
 
@@ -179,3 +185,128 @@ def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows column
     light, variance = np.maximum(merged.rate_e_per_s + dark, 0.0), merged.sigma_e_per_s**2
     slope = 2.0 * variance / (light + np.sqrt(light**2 + 4.0 * floor * variance))
     return np.where(merged.used > 0, slope, 0.0)
+
+
+def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfRules | None = None) -> Diffraction:
+    """Return the start of diffraction: the wire's panel and pupil, or the rig's if no wire was seen.
+
+    Args:
+        rig: the panel and the lens as described; lengths in mm.
+        geometry: has the pupil's position, in mm.
+        wire: its numbers are in pitches of the panel.
+        rules: the blur, and which pitches are well known.
+    """
+    panel, pitch, rules = rig.panel, rig.panel.pitch_mm.value, rules or PsfRules()
+    nodes = wavelengths_nm(rig, rules)
+    # Those of common colour filters.
+    responses = np.exp(-0.5 * ((nodes - np.array([[600.0], [535.0], [460.0]])) / 45.0) ** 2) + 1e-3
+    pupil = np.asarray(geometry.pupil_mm, dtype=np.float64)
+    # Only a wire fit that saw the rows knows the place of the pupil's footprint on them.
+    if seen := np.shape(wire.harmonics)[0] > 0:
+        opened, offset = (wire.column_open, wire.row_open), wire.offset_periods
+        lengths = (wire.depth_per_pitch, wire.footprint_per_pitch, wire.standoff_per_pitch)
+    else:
+        opened, offset = (panel.column_open.value, panel.row_open.value), pupil[:2] / pitch
+        lengths = (panel.depth_mm.value / pitch, rig.pupil_diameter_mm / pitch, -pupil[2] / pitch)
+    depth, footprint, standoff = (np.float64(float(length)) for length in lengths)
+    return Diffraction(
+        pitch_mm=np.float64(pitch),
+        openings=np.array([float(part) for part in opened]),
+        depth_mm=depth * pitch,
+        pupil_diameter_mm=footprint * pitch,
+        blur_px=np.float64(rules.blur_px),
+        blur_growth=np.zeros(2),
+        blur_colour=np.zeros(3),
+        offset_periods=np.asarray(offset, dtype=np.float64),
+        standoff_per_pitch=standoff,
+        visibility=np.float64(seen),
+        wavelengths_nm=nodes,
+        spectrum=responses / responses.sum(axis=1, keepdims=True),
+    )
+
+
+def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
+    """Return the parameters as one vector: see ``Evaluator.model``; blur and spectra as logarithms.
+
+    The kernel depends on the square of the blur. The logarithm avoids its two signs and its zero derivative at 0.
+    """
+    logs = np.log(np.maximum(np.asarray(model.spectrum), 1e-6))
+    red, green, blue = np.asarray(model.blur_colour)
+    lens = [np.log(model.blur_px) + green, *np.asarray(model.blur_growth), red - green, blue - green]
+    head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm, *lens]
+    head += [*np.asarray(model.offset_periods), model.standoff_per_pitch]
+    return np.concatenate([np.array(head, dtype=float), (logs - logs.mean(axis=1, keepdims=True)).ravel()])
+
+
+def as_numpy(model: Diffraction) -> Diffraction:
+    """Return the model with numpy leaves."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), model)
+
+
+def wavelengths_nm(rig: RigDescription, rules: PsfRules) -> Float[np.ndarray, " nodes"]:
+    """Return the spectra's nodes in nm: those of daylight, wider by the pitch's tolerance where that is large."""
+    relative = min(pitch_tolerance(rig), rules.pitch_least_known)
+    if relative <= rules.pitch_well_known:
+        return WAVELENGTHS_NM
+    first, last = WAVELENGTHS_NM[0] * (1 - relative), WAVELENGTHS_NM[-1] * (1 + relative)
+    return np.linspace(first, last, round((last - first) / (WAVELENGTHS_NM[1] - WAVELENGTHS_NM[0])) + 1)
+
+
+def pitch_tolerance(rig: RigDescription) -> float:
+    """Return the relative tolerance of the pitch, in which the psf measures all lengths."""
+    return rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
+
+
+def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None = None) -> Prior:
+    """Return the prior: the rig's tolerances, tighter for what the wire has measured, and smooth spectra.
+
+    Diffraction depends on wavelength / pitch only. The pitch is therefore held at the rig's value, and the spectra are
+    free to move: an error of the pitch then appears as an error of the wavelengths.
+
+    Args:
+        rig: its tolerances (mm, or fractions) are taken for standard deviations.
+        start: the mean; its ``visibility`` says whether the wire has measured the panel's numbers.
+        rules: sigmas of the other parameters.
+    """
+    panel, theta, rules = rig.panel, pack(start), rules or PsfRules()
+    tighter = rules.wire_tolerance if start.visibility else 1.0
+    pitch_mm = rules.pitch_tolerance * min(panel.pitch_mm.tolerance, rules.pitch_well_known * panel.pitch_mm.value)
+    pupil_mm = 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value
+    of_wire = [panel.column_open.tolerance, panel.row_open.tolerance, panel.depth_mm.tolerance, pupil_mm]
+    of_blur = np.repeat([rules.blur_log_sigma, rules.blur_growth, rules.blur_colour], (1, 2, 2))
+    sigma = [pitch_mm, *(tighter * np.array(of_wire)), *of_blur, *3 * (rules.footprint_periods,)]
+    roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]
+    for pick in np.eye(theta.size)[HEAD:].reshape(3, -1, theta.size):
+        roots += [np.diff(pick, 2, axis=0) / rules.spectrum_bend, pick / rules.spectrum_sigma]
+    return Prior(theta.copy(), np.concatenate(roots))
+
+
+def some_shots(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, " shots"]:
+    """Choose shots for the fit of diffraction, evenly over the positions not held out and over their shifts."""
+
+    def spread(items: np.ndarray, most: int) -> np.ndarray:
+        return items[np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+    keep = np.zeros(shots.count, dtype=bool)
+    for place in spread(np.flatnonzero(~held_out_positions(shots.positions)), rules.positions):
+        keep[spread(np.flatnonzero(shots.position == place), rules.shifts)] = True
+    return keep
+
+
+def choose_samples(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, "shots rows columns"]:
+    """Return which samples are fitted: all near the peak and a seeded draw of the others, as many in every shot."""
+    rng = np.random.default_rng(2)
+    x, y = np.moveaxis(np.abs(shots.offsets()), -1, 0)
+    inside = (x <= rules.close_px[1]) & (y <= rules.close_px[0])
+    near = (x <= rules.peak_half_px[1]) & (y <= rules.peak_half_px[0]) & inside
+    far = np.flatnonzero((inside & ~near).ravel())
+    chosen = np.tile(near.ravel(), (shots.count, 1))
+    for row in chosen:
+        row[rng.choice(far, round(len(far) * rules.far_fraction), replace=False)] = True
+    return chosen.reshape(shots.rate.shape)
+
+
+def stands_for(shots: Shots, rules: PsfRules) -> Float[np.ndarray, "shots n"]:
+    """Return how many samples of a picture each chosen one represents: 1 near the peak, more where it was drawn."""
+    chosen, near = choose_samples(shots, rules), choose_samples(shots, replace(rules, far_fraction=0.0))
+    return np.where(near[chosen].reshape(shots.count, -1), 1.0, 1.0 / rules.far_fraction)
