@@ -56,9 +56,7 @@ HEAD: Final = 13
 PITCH, PUPIL, BLUR, GROWTH, FOOTPRINT = 0, 4, 5, slice(6, 8), slice(10, 13)
 BLUR_RED, BLUR_BLUE = 8, 9
 OWN: Final = 6
-_PER_SAMPLE: Final = (
-    *("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps"),
-)
+_PER_SAMPLE = ("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps")
 # Parameters of diffraction; own parameters and light of the shots, of one position or of all.
 Theta = Float[np.ndarray, " p"]
 Own = Float[np.ndarray, "*positions shots l"]
