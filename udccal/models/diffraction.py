@@ -117,7 +117,16 @@ def average_transfer(
     """
     fx, fy = lattice_frequencies(frame, lattice)
     columns, rows = (table[0] for table in slits_of(model, open_fractions(model, frame), fx, fy, 0))
-    total = average_of(columns, rows, pupil_overlaps(model, frame, lattice), pupil_anchors(model)[1], spectra)
+
+    def add(
+        total: Float[Array, "3 rows half"], anchor: tuple[Array, Array]
+    ) -> tuple[Float[Array, "3 rows half"], None]:
+        pupil, part = anchor
+        return total + jnp.einsum("cj,yj,xj->cyx", spectra * part, rows, columns) * pupil, None
+
+    # A loop over overlaps computed beforehand: without it the compiler computes them again for every channel.
+    anchors = pupil_overlaps(model, frame, lattice), pupil_anchors(model)[1]
+    total, _ = jax.lax.scan(add, jnp.zeros((3, rows.shape[0], columns.shape[0])), anchors)
     return through_sensor(total, sensor_transfer(frame, fx, fy, blur_variance(model, frame), disc_px))
 
 
@@ -133,32 +142,6 @@ def pupil_overlaps(model: Diffraction, frame: LocalFrame, lattice: Frequencies) 
     distance = jnp.sqrt(lag_x**2 + lag_y**2 + 1e-30)
     anchors, _ = pupil_anchors(model)
     return jax.lax.map(lambda anchor: disc_autocorrelation(distance * (anchor * 1e-6)), anchors)
-
-
-def average_of(
-    columns: Float[Array, "half nodes"],
-    rows: Float[Array, "rows nodes"],
-    pupils: Float[Array, "anchors rows half"],
-    share: Float[Array, "anchors nodes"],
-    spectra: Float[Array, "c nodes"],
-) -> Float[Array, "c rows half"]:
-    """Return transfer functions without the sensor. They are linear in every argument.
-
-    Args:
-        columns: ``slits_of`` the columns, order 0. rows: those of the rows.
-        pupils: overlaps from ``pupil_overlaps``.
-        share: weights from ``pupil_anchors``.
-        spectra: light at the wavelength nodes.
-    """
-
-    def add(
-        total: Float[Array, "c rows half"], anchor: tuple[Array, Array]
-    ) -> tuple[Float[Array, "c rows half"], None]:
-        pupil, own = anchor
-        return total + jnp.einsum("cj,yj,xj->cyx", spectra * own, rows, columns) * pupil, None
-
-    # A loop over overlaps computed beforehand: without it the compiler computes them again for every channel.
-    return jax.lax.scan(add, jnp.zeros((spectra.shape[0], rows.shape[0], columns.shape[0])), (pupils, share))[0]
 
 
 def through_sensor(

@@ -54,7 +54,18 @@ def interference_transfer(
     """
     fx, fy = lattice_frequencies(frame, lattice)
     columns, rows = slits_of(model, open_fractions(model, frame), fx, fy, HIGHEST_ORDER)
-    total = interference_of(strengths(model, footprint_place(model, frame)), columns, rows, overlaps, spectra)
+    strength = strengths(model, footprint_place(model, frame))
+
+    def add(
+        total: Float[Array, "3 rows half"], node: tuple[Array, Array, Array, Array]
+    ) -> tuple[Float[Array, "3 rows half"], None]:
+        column, row, overlap, part = node
+        down = strength[:, None] * row[_ROW_OF]
+        here = jnp.sum(down[:, :, None] * column[_COLUMN_OF][:, None, :] * overlap, axis=0)
+        return total + part[:, None, None] * here, None
+
+    nodes = (jnp.moveaxis(columns, -1, 0), jnp.moveaxis(rows, -1, 0), jnp.asarray(overlaps), spectra.T)
+    total, _ = jax.lax.scan(add, jnp.zeros((3, rows.shape[1], columns.shape[1])), nodes)
     return through_sensor(total, sensor_transfer(frame, fx, fy, blur_variance(model, frame), disc_px))
 
 
@@ -71,34 +82,6 @@ def strengths(model: Diffraction, place: Float[Arrayish, "2"]) -> Float[Array, "
         place: (X, Y), the footprint's centre on columns and rows in pitches.
     """
     return model.visibility * 2.0 * jnp.cos(2.0 * jnp.pi * (jnp.array(TERMS) @ jnp.asarray(place)))
-
-
-def interference_of(
-    strength: Float[Array, " terms"],
-    columns: Float[Array, "orders half nodes"],
-    rows: Float[Array, "orders rows nodes"],
-    overlaps: Float[Arrayish, "nodes terms rows half"],
-    spectra: Float[Array, "c nodes"],
-) -> Float[Array, "c rows half"]:
-    """Return transfer functions without the sensor. They are linear in every argument.
-
-    Args:
-        strength: from ``strengths``.
-        columns: ``slits_of`` the columns up to ``HIGHEST_ORDER``. rows: those of the rows.
-        overlaps: from ``node_overlaps``.
-        spectra: light at the wavelength nodes.
-    """
-
-    def add(
-        total: Float[Array, "c rows half"], node: tuple[Array, Array, Array, Array]
-    ) -> tuple[Float[Array, "c rows half"], None]:
-        column, row, overlap, share = node
-        down = strength[:, None] * row[_ROW_OF]
-        here = jnp.sum(down[:, :, None] * column[_COLUMN_OF][:, None, :] * overlap, axis=0)
-        return total + share[:, None, None] * here, None
-
-    nodes = (jnp.moveaxis(columns, -1, 0), jnp.moveaxis(rows, -1, 0), jnp.asarray(overlaps), spectra.T)
-    return jax.lax.scan(add, jnp.zeros((spectra.shape[0], rows.shape[1], columns.shape[1])), nodes)[0]
 
 
 def node_overlaps(
