@@ -27,13 +27,12 @@ def main() -> None:
     # Variance of a bin's rate per unit of light, and in the dark.
     shot = np.full(light.shape, 1 / (EXPOSURE_S * SAMPLES))
     rest = np.full(light.shape, (READ_E / EXPOSURE_S) ** 2 / SAMPLES)
-    rate = shot * rng.poisson(light / shot) + np.sqrt(rest) * rng.standard_normal(light.shape)
-    one, crop = np.ones(len(light)), visible_crop(geometry, profile.rig)
-    shots = Binned(rate, shot, rest, light < 0, EXPOSURE_S * one, one)
+    rate, one = shot * rng.poisson(light / shot) + np.sqrt(rest) * rng.standard_normal(light.shape), np.ones(len(light))
+    shots, crop = Binned(rate, shot, rest, light < 0, EXPOSURE_S * one, one), visible_crop(geometry, profile.rig)
     data = BackscatterData(shots, np.stack([crop.of(picture) for picture in pictures]), crop, tuple("abcdefgh"))
     found = udccal.fit_backscatter(data, geometry, profile.rig).or_raise()
-    print(found.status.name)
-    print(*(f"{e.name:18} {e.value:9.5f} ± {e.sigma:.5f} {e.unit}" for e in found.estimates), sep="\n")
+    lines = [f"{e.name:18} {e.value:9.5f} ± {e.sigma:.5f} {e.unit}" for e in found.estimates]
+    print(found.status.name, *lines, sep="\n")
 
 
 if __name__ == "__main__":
