@@ -13,7 +13,7 @@ from tests.profiles.conftest import fitted
 from tests.validation.judged import failed, named
 from udccal.arrangements import BoardSpec
 from udccal.board.charuco import board_points_mm
-from udccal.fitting.geometry.bundle import camera_matrix, intrinsics_of
+from udccal.fitting.geometry.bundle import Intrinsics
 from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.data import BoardView
 from udccal.models.geometry import Geometry
@@ -52,7 +52,7 @@ def views() -> tuple[BoardView, ...]:
 
 def _view(rng: np.random.Generator, turn: Rotation, number: int) -> BoardView:
     of, board = lens(), board_points_mm(SPEC)
-    matrix = camera_matrix(intrinsics_of(of))
+    matrix = Intrinsics.of_geometry(of).opencv[0]
     away = np.array([*rng.uniform(-80, 80, 2), 800.0]) - turn.apply(board.mean(axis=0))
     seen = cv2.projectPoints(board, turn.as_rotvec(), away, matrix, of.distortion)[0].reshape(-1, 2)
     seen = seen + SIGMA_PX * rng.normal(size=seen.shape)

@@ -27,8 +27,8 @@ from udccal.fitting.geometry.bundle import (
     RULES,
     Bundle,
     BundleProblem,
+    Intrinsics,
     Points,
-    intrinsics_of,
     projected,
 )
 from udccal.fitting.geometry.data import best_poses, gather, rig_prior
@@ -69,7 +69,7 @@ class BoardViews:
 
     def __init__(self, state: RigState) -> None:
         self._state, self._field = state, EvenField(state)
-        self.intrinsics = intrinsics_of(state.geometry)
+        self.intrinsics = Intrinsics.of_geometry(state.geometry).vector
 
     def planned(self, step: PlannedStep, board: Board) -> BoardView | None:
         """Return the view of a board in the light of a step; None where it shows too few corners to hold its pose."""
@@ -117,7 +117,7 @@ class BoardViews:
         return BundleProblem(points, EVERY).equations_at(Bundle(self.intrinsics, view.pose[None])).marginal()[0]
 
     def _window_px(self, spec: BoardSpec, depth_mm: float) -> float:
-        square_px = spec.square_mm / depth_mm * self.intrinsics[0]
+        square_px = spec.square_mm / depth_mm * Intrinsics.of(self.intrinsics).focal_px[0]
         return float(np.clip(_WINDOW_SQUARES * square_px, *RULES.window_px))
 
     def _inside(self, pixels: Float[np.ndarray, "n 2"], margin: float) -> Bool[np.ndarray, " n"]:
@@ -171,7 +171,7 @@ class GeometryPredictor:
         points = points.scaled(np.array([1.0 if view.parallel else count**-0.5 for view in views]))
         bundle = Bundle(self._intrinsics, np.array([view.pose for view in views]))
         problem = BundleProblem(points, self._order(points, bundle), self._prior)
-        x, cov = with_angles(bundle, problem.equations_at(bundle).joint_cov(), parallel)
+        x, cov = with_angles(bundle.intrinsics, bundle.poses, problem.equations_at(bundle).joint_cov(), parallel)
         posterior = Posterior.from_cov(x, cov, functools.partial(term_at, pupil=self._state.geometry.pupil_mm))
         sigma = projection_sigma_px(posterior, sensor_samples(self._state.rig, _ACROSS))
         return float(np.sqrt((sigma**2).mean()))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.board.charuco import board_points_mm
-from udccal.fitting.geometry.bundle import camera_matrix, intrinsics_of
+from udccal.fitting.geometry.bundle import Intrinsics
 from udccal.fitting.geometry.data import BoardView
 from udccal.models.geometry import Geometry
 
@@ -35,8 +35,7 @@ def board_evidence(boards: Sequence[BoardView], geometry: Geometry) -> BoardEvid
 
 def _residuals(view: BoardView, geometry: Geometry) -> Float[np.ndarray, "n 2"]:
     """Return found minus projected corners in px, with the pose that fits this view best."""
-    intrinsics = intrinsics_of(geometry)
-    lens = camera_matrix(intrinsics), intrinsics[4:]
+    lens = Intrinsics.of_geometry(geometry).opencv
     points_mm = board_points_mm(view.spec)[view.corners.ids]
     _, rotation, translation = cv2.solvePnP(points_mm, view.corners.xy, *lens)
     projected, _ = cv2.projectPoints(points_mm, rotation, translation, *lens)

@@ -16,9 +16,9 @@ from udccal.fitting.geometry.bundle import (
     LENS,
     RULES,
     Bundle,
+    Intrinsics,
     Points,
     in_sigma,
-    intrinsics_of,
     linearised,
     solve,
 )
@@ -52,7 +52,7 @@ def judge_geometry(
     views = [view for view in views if view.usable()]
     if not views:
         return unusable("geometry", "No board shows enough corners. Capture the boards again, evenly lit and sharp.")
-    lens = intrinsics_of(result.term)
+    lens = Intrinsics.of_geometry(result.term).vector
     given = _points(views, result)
     if not given.names:
         return unusable("geometry", "No board holds a pose. Capture boards that show two rows of corners or more.")

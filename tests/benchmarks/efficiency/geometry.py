@@ -17,7 +17,7 @@ from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, calibrated, sight
 from tests.scenes.information import fisher_information
 from udccal.board.charuco import board_points_mm
 from udccal.fitting.engine.gaussian import cramer_rao
-from udccal.fitting.geometry.bundle import LENS, intrinsics_of, lens_alone
+from udccal.fitting.geometry.bundle import LENS, Intrinsics
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.fitting.geometry.data import GeometryData
 from udccal.fitting.geometry.fit import fit_boards, projection_sigma_px
@@ -40,12 +40,16 @@ def corners_seen(
     x: Float[Array, " n"], board: Float[Array, "corners 3"], variance: Float[Array, " samples"]
 ) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
     """Mean and variance of all coordinates; ``x`` is the intrinsics and the poses."""
-    camera = lens_alone(x)
+    camera = _camera(x)
 
     def one(pose: Float[Array, "6"]) -> Float[Array, "corners 2"]:
         return project(camera, board @ rotation_matrix(pose[:3]).T + pose[3:])
 
     return jax.vmap(one)(x[LENS:].reshape(-1, 6)).ravel(), variance
+
+
+def _camera(x: Float[Array, " n"]) -> Geometry:
+    return Intrinsics.of(x).camera()
 
 
 def _angles_deg(x: Float[Array, " n"]) -> Float[Array, "3"]:
@@ -57,12 +61,12 @@ def _angles_deg(x: Float[Array, " n"]) -> Float[Array, "3"]:
 
 def _landed(x: Float[Array, " n"], directions: Float[Array, "rays 3"]) -> Float[Array, " coordinates"]:
     """Where directions fixed to the parallel board land."""
-    return project(lens_alone(x), directions @ rotation_matrix(x[LENS : LENS + 3]).T).ravel()
+    return project(_camera(x), directions @ rotation_matrix(x[LENS : LENS + 3]).T).ravel()
 
 
 def _lens_alone(x: Float[Array, " n"], rays: Float[Array, "rays 3"]) -> Float[Array, " coordinates"]:
     """Where rays fixed to the camera land."""
-    return project(lens_alone(x), rays).ravel()
+    return project(_camera(x), rays).ravel()
 
 
 def trials(share: float = 1.0) -> list[Trials]:
@@ -100,7 +104,7 @@ def _drawn(seed: int) -> Sight:
 def _of_lens(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(error, sigma, bound) by realisation: of the numbers, of rays of the panel, and of rays of the lens."""
     scene = _drawn(seed)
-    truth = np.append(intrinsics_of(scene.camera), scene.poses.ravel())
+    truth = np.append(Intrinsics.of_geometry(scene.camera).vector, scene.poses.ravel())
     board = board_points_mm(scene.spec)
     variance = np.repeat(np.where(scene.seen(), scene.sigma_px**2, _UNSEEN_PX2).ravel(), 2)
     information = fisher_information(corners_seen, truth, board, variance)
@@ -165,7 +169,7 @@ def _panel_rays(result: FitResult[Geometry], turned: np.ndarray, pixels: np.ndar
 
 
 def _lens_rays(bundle: CalibratedViews, rays: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    camera = lens_alone(bundle.intrinsics)
+    camera = bundle.intrinsics.camera()
     turn = np.zeros(3)
     for _ in range(4):
         now = rays @ np.asarray(rotation_matrix(turn)).T

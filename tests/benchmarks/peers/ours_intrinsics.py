@@ -54,7 +54,7 @@ def same(found: CalibratedViews, reference: CalibratedViews) -> bool:
     """Whether two calibrations are one minimum: within a hundredth of a sigma in everything."""
     sigma = np.sqrt(np.diag(reference.cov))[:9]
     told = sigma > 0
-    off = np.abs(found.intrinsics - reference.intrinsics)
+    off = np.abs(found.intrinsics.vector - reference.intrinsics.vector)
     return found.free == reference.free and bool((off[told] < 0.01 * sigma[told]).all())
 
 
@@ -85,7 +85,7 @@ def aligned(works: ModuleType, intrinsics: np.ndarray) -> np.ndarray:
 def z_scores(works: ModuleType, result: CalibratedViews) -> np.ndarray:
     """Errors after the best common rotation in units of their sigma, (81, 2)."""
     cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
-    return aligned(works, result.intrinsics) / np.sqrt(np.einsum("nii->ni", cov))
+    return aligned(works, result.intrinsics.vector) / np.sqrt(np.einsum("nii->ni", cov))
 
 
 def spread(works: ModuleType, seeds: int) -> tuple[float, float]:
@@ -121,7 +121,7 @@ def main() -> None:
         seconds.append(taken)
         cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
         sigmas.append(np.sqrt(np.einsum("nii->ni", cov)))
-    metrics = [works.intrinsics_metrics(result.intrinsics) for result in results]
+    metrics = [works.intrinsics_metrics(result.intrinsics.vector) for result in results]
     pooled = {key: float(np.sqrt(np.mean([m[key] ** 2 for m in metrics]))) for key in metrics[0]}
     z_std, z_std_error = spread(works, options.covered)
     found = converged(works, data, results, options.starts) if options.starts else None

@@ -12,7 +12,7 @@ from tests.fitting.geometry.boards import Sight, sight
 from tests.scenes.information import fisher_information
 from udccal.board.charuco import board_points_mm
 from udccal.fitting.engine.gaussian import cramer_rao
-from udccal.fitting.geometry.bundle import LENS, intrinsics_of
+from udccal.fitting.geometry.bundle import LENS, Intrinsics
 from udccal.fitting.geometry.fit import fit_geometry
 from udccal.numerics import in_float64
 
@@ -88,7 +88,7 @@ def answer(scene: Sight, seed: int, missing: float, far: float, swapped: int) ->
 
 def _least(scene: Sight) -> np.ndarray:
     """The bound with all coefficients of distortion and every corner in the picture."""
-    true = np.append(intrinsics_of(scene.camera), scene.poses.ravel())
+    true = np.append(Intrinsics.of_geometry(scene.camera).vector, scene.poses.ravel())
     variance = np.repeat(np.where(scene.seen(), scene.sigma_px**2, _UNSEEN_PX2).ravel(), 2)
     information = fisher_information(corners_seen, true, board_points_mm(scene.spec), variance)
     return cramer_rao(information, np.eye(len(true))[:LENS])

@@ -43,7 +43,7 @@ def errors(found: CalibratedViews, scene: Sight = SCENE) -> np.ndarray:
     """Of the free intrinsics, in sigma."""
     truth = np.concatenate([scene.camera.focal_px, scene.camera.principal_point_px, scene.camera.distortion])
     free = np.array(found.free)
-    return ((found.intrinsics - truth) / np.sqrt(np.maximum(np.diag(found.cov)[:9], 1e-300)))[free]
+    return ((found.intrinsics.vector - truth) / np.sqrt(np.maximum(np.diag(found.cov)[:9], 1e-300)))[free]
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_any_start_leads_to_the_same_lens(plain: CalibratedViews, factor: float)
     start = Geometry(SCENE.camera.focal_px * factor, np.array([300.0, 600.0]), np.zeros(5), np.zeros(3), np.zeros(3))
     poses = np.hstack([rng.uniform(-3, 3, (8, 3)), rng.uniform([-500, -500, -900], [500, 500, 2000], (8, 3))])
     found = calibrate(start=start, start_poses=poses)
-    np.testing.assert_allclose(found.intrinsics, plain.intrinsics, atol=1e-3)
+    np.testing.assert_allclose(found.intrinsics.vector, plain.intrinsics.vector, atol=1e-3)
     assert (found.poses[:, 5] > 0).all()
 
 
@@ -177,7 +177,7 @@ def test_whatever_the_views_a_lens_or_advice(seed: int, tilt: float, lean: float
         assert sum((np.isfinite(view[:, 0]).sum() >= 6) for view in image) < 8
         return
     sigma_of_ray = found.projection_covariance(np.array([[100.0, 100.0]]))
-    numbers = (found.intrinsics, found.poses, found.cov, found.residuals_px, sigma_of_ray)
+    numbers = (found.intrinsics.vector, found.poses, found.cov, found.residuals_px, sigma_of_ray)
     assert all(np.isfinite(part).all() for part in numbers)
     if found.status is FitStatus.CONVERGED:
         assert np.abs(errors(found, scene)[:2]).max() < 5
@@ -189,7 +189,7 @@ def test_the_term_of_arrays_has_the_lens_and_the_sigma_of_its_rays(plain: Calibr
     board, image, sigma = arrays()
     found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
     assert found.or_raise() is found
-    np.testing.assert_allclose(found.term.distortion, plain.intrinsics[4:])
+    np.testing.assert_allclose(found.term.distortion, plain.intrinsics.distortion)
     assert [e.name for e in found.estimates] == list(NAMES)
     np.testing.assert_allclose([e.sigma for e in found.estimates], np.sqrt(np.diag(plain.cov)[:9]))
     pixels = np.array([[511.0, 383.0], [40.0, 60.0], [980.0, 700.0]])

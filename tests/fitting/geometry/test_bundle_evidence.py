@@ -13,7 +13,7 @@ from tests.fitting.geometry.boards import calibrated, sight
 from tests.fitting.geometry.test_bundle import SCENE, arrays
 from udccal.board.charuco import board_points_mm
 from udccal.errors import FitError
-from udccal.fitting.geometry.bundle import ORDERS, intrinsics_of, projected
+from udccal.fitting.geometry.bundle import ORDERS, Intrinsics, projected
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.result import FitStatus
 
@@ -39,8 +39,8 @@ def test_rays_are_surer_the_less_they_are_fixed_to(plain: CalibratedViews) -> No
 
 def test_a_turn_of_camera_and_poses_together_moves_no_ray_of_the_boards(plain: CalibratedViews) -> None:
     """The freedom itself, as a covariance: the centre moves by a pixel and all boards turn to make up for it."""
-    middle = plain.intrinsics[None, 2:4]
-    _, slopes = projected(plain.intrinsics, np.array([[0.0, 0.0, 1.0]]))
+    middle = plain.intrinsics.principal_point_px[None]
+    _, slopes = projected(plain.intrinsics.vector, np.array([[0.0, 0.0, 1.0]]))
     direction = np.zeros(len(plain.cov))
     direction[2] = 1.0
     needed = -np.linalg.lstsq(slopes[0, :, 9:12], slopes[0, :, 2], rcond=None)[0]
@@ -79,7 +79,7 @@ def test_error_bars_of_views_that_disagree_are_those_of_drawn_lenses() -> None:
     scene = sight(views=12, sigma_px=0.06)
     flat = board_points_mm(scene.spec)
     u, v = ((flat - flat.mean(axis=0)) / np.ptp(flat[:, :2]))[:, :2].T
-    truth = intrinsics_of(scene.camera)
+    truth = Intrinsics.of_geometry(scene.camera).vector
     plain = calibrated([flat] * 12, arrays(scene)[1], scene.size)
     z, noise_z = [], []
     for seed in range(30):
@@ -92,9 +92,9 @@ def test_error_bars_of_views_that_disagree_are_those_of_drawn_lenses() -> None:
         found = calibrated([flat] * 12, pictures, scene.size)
         assert found.disagreement.found
         free = np.array(found.free)
-        z.append(((found.intrinsics - truth) / np.sqrt(np.diag(found.cov)[:9] + ~free))[:4])
+        z.append(((found.intrinsics.vector - truth) / np.sqrt(np.diag(found.cov)[:9] + ~free))[:4])
         scale = np.median(found.points.sigma) / np.median(plain.points.sigma)
-        noise_z.append((found.intrinsics - truth)[:4] / (scale * np.sqrt(np.diag(plain.cov)[:4])))
+        noise_z.append((found.intrinsics.vector - truth)[:4] / (scale * np.sqrt(np.diag(plain.cov)[:4])))
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.35
     assert np.sqrt(np.mean(np.square(noise_z))) > 2.5  # what the test must reject
 
@@ -103,7 +103,9 @@ def test_a_ray_has_a_covariance_wherever_the_lens_does_not_fold(plain: Calibrate
     columns, rows = SCENE.size
     edges = np.array([[x, y] for x in (0.0, columns / 2, columns - 1.0) for y in (0.0, rows / 2, rows - 1.0)])
     assert np.isfinite(plain.projection_covariance(edges)).all()
-    folded = replace(plain, intrinsics=np.array([400.0, 400.0, 511.5, 383.5, -0.5, 0, 0, 0, 0]))
+    folded = replace(
+        plain, intrinsics=Intrinsics(np.full(2, 400.0), np.array([511.5, 383.5]), np.array([-0.5, 0, 0, 0, 0]))
+    )
     assert np.isfinite(folded.projection_covariance(edges[4:5])).all()
     with pytest.raises(FitError, match=r"distortion folds"):
         folded.projection_covariance(edges)
@@ -168,7 +170,7 @@ def test_sigmas_hold_where_small_coefficients_are_dropped() -> None:
         scene = sight(seed=seed, views=6, distortion=np.array([-0.1, 0.02, *small, 0.0]), sigma_px=0.2)
         boards, images, _ = arrays(scene, seed)
         found = calibrated(boards, images, scene.size)
-        centre = found.intrinsics[2:4]
+        centre = np.array(found.intrinsics.principal_point_px)
         z.append((centre - scene.camera.principal_point_px) / np.sqrt(np.diag(found.cov)[2:4]))
     assert np.sqrt(np.mean(np.square(z))) < 1.6
 
@@ -185,7 +187,7 @@ def test_sigmas_hold_whether_a_lens_has_a_coefficient_or_not(far: dict[str, Any]
         bend = [-0.07, 0.035, *rng.normal(0, 1e-3, 2) * tangential * size[0], rng.normal(0, 0.1) * last * size[1]]
         scene = sight(seed=seed, views=int(rng.integers(5, 14)), distortion=np.array(bend), **far)
         found = calibrated(*arrays(scene, seed)[:2], scene.size)
-        off = found.intrinsics - intrinsics_of(scene.camera)
+        off = found.intrinsics.vector - Intrinsics.of_geometry(scene.camera).vector
         z.append(off / np.sqrt(np.diag(found.cov)[: len(off)]))
     assert np.abs(z).max() < 4.5
     assert (np.sqrt(np.mean(np.square(z), axis=0)) < 1.4).all()

@@ -13,10 +13,8 @@ from udccal.fitting.geometry.bundle import (
     EVERY,
     ORDERS,
     Bundle,
+    Intrinsics,
     Solved,
-    camera_matrix,
-    intrinsics_of,
-    lens_alone,
     linearised,
     solve,
 )
@@ -25,7 +23,7 @@ from udccal.fitting.geometry.views import starts
 from udccal.models.geometry import project, rotation_matrix
 
 POINTS = gather(*arrays()).points
-TRUTH = Bundle(intrinsics_of(SCENE.camera), SCENE.poses)
+TRUTH = Bundle(Intrinsics.of_geometry(SCENE.camera).vector, SCENE.poses)
 NO_PRIOR = Prior(np.zeros(9), np.zeros((0, 9)))
 
 
@@ -35,10 +33,10 @@ def solved() -> Solved:
 
 
 def test_the_packing_is_one_and_goes_both_ways() -> None:
-    lens = lens_alone(np.arange(9.0))
-    np.testing.assert_array_equal(intrinsics_of(lens), np.arange(9.0))
-    np.testing.assert_array_equal(lens.distortion, [4.0, 5.0, 6.0, 7.0, 8.0])
-    np.testing.assert_array_equal(camera_matrix(intrinsics_of(lens)), [[0, 0, 2], [0, 1, 3], [0, 0, 1]])
+    lens = Intrinsics.of(np.arange(9.0))
+    np.testing.assert_array_equal(lens.vector, np.arange(9.0))
+    np.testing.assert_array_equal(lens.camera().distortion, [4.0, 5.0, 6.0, 7.0, 8.0])
+    np.testing.assert_array_equal(lens.opencv[0], [[0, 0, 2], [0, 1, 3], [0, 0, 1]])
     assert [int(free.sum()) for free in ORDERS.values()] == [4, 5, 6, 7, 8, 9]
 
 
@@ -50,7 +48,7 @@ def test_places_and_slopes_are_those_of_the_model() -> None:
     board = POINTS.board[mine]
 
     def seen(x: jax.Array) -> jax.Array:
-        return project(lens_alone(x), board @ rotation_matrix(x[9:12]).T + x[12:])
+        return project(Intrinsics.of(x[:9]).camera(), board @ rotation_matrix(x[9:12]).T + x[12:])
 
     with jax.enable_x64(True):
         x = np.concatenate([TRUTH.intrinsics, SCENE.poses[2]])

@@ -28,7 +28,8 @@ ORDERS = {
     for name in ("no distortion", "k1", "k1 k2", "k1 k2 k3", "k1 k2 p1 p2", "k1 k2 p1 p2 k3")
 }
 EVERY = np.ones(LENS, dtype=bool)
-Intrinsics = Float[np.ndarray, "9"]
+# Intrinsics as the solver has them; see ``Intrinsics``.
+Lens = Float[np.ndarray, "9"]
 Free = Bool[np.ndarray, "9"]
 # Of each view, board to camera: rotation vector (rad), then translation (board's unit).
 Poses = Float[np.ndarray, "views 6"]
@@ -86,25 +87,47 @@ class GeometryRules:
 RULES: Final = GeometryRules()
 
 
-def intrinsics_of(geometry: Geometry) -> Intrinsics:
-    """Intrinsics of a fitted or nominal term as a vector, in the order of ``INTRINSIC_NAMES``."""
-    return np.concatenate([geometry.focal_px, geometry.principal_point_px, geometry.distortion], dtype=np.float64)
+@final
+@dataclass(frozen=True)
+class Intrinsics:
+    """The nine numbers of a lens, or the first nine of a vector, by name; see ``Geometry``.
 
+    ``of`` and ``vector`` convert from and to a vector in the order of ``INTRINSIC_NAMES``, numpy's or JAX's.
+    """
 
-def centred(focal_px: float, image_size: tuple[int, int]) -> Intrinsics:
-    """Intrinsics without distortion, about the middle of the picture of (columns, rows)."""
-    return np.concatenate([np.full(2, focal_px), (np.array(image_size) - 1) / 2, np.zeros(5)])
+    focal_px: Float[Arrayish, "2"]
+    principal_point_px: Float[Arrayish, "2"]
+    distortion: Float[Arrayish, "5"]
 
+    @classmethod
+    def of(cls, vector: Float[Arrayish, " n"]) -> Intrinsics:
+        """From a vector that begins with intrinsics."""
+        return cls(vector[:2], vector[2:4], vector[4:LENS])
 
-def lens_alone(intrinsics: Float[Arrayish, " n"]) -> Geometry:
-    """The term of a vector that begins with intrinsics (numpy or JAX): camera coordinates are the panel's."""
-    return Geometry(intrinsics[:2], intrinsics[2:4], intrinsics[4:LENS], np.zeros(3), np.zeros(3))
+    @classmethod
+    def of_geometry(cls, geometry: Geometry) -> Intrinsics:
+        """Of a fitted or nominal term."""
+        return cls(geometry.focal_px, geometry.principal_point_px, geometry.distortion)
 
+    @classmethod
+    def centred(cls, focal_px: float, image_size: tuple[int, int]) -> Intrinsics:
+        """Without distortion, about the middle of the picture of (columns, rows)."""
+        return cls(np.full(2, focal_px), (np.array(image_size) - 1) / 2, np.zeros(5))
 
-def camera_matrix(intrinsics: Intrinsics) -> Float[np.ndarray, "3 3"]:
-    """OpenCV's camera matrix."""
-    fx, fy, cx, cy = intrinsics[:4]
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    @property
+    def vector(self) -> Lens:
+        """In double precision."""
+        return np.concatenate([self.focal_px, self.principal_point_px, self.distortion], dtype=np.float64)
+
+    @property
+    def opencv(self) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "5"]]:
+        """OpenCV's camera matrix and coefficients of the distortion."""
+        (fx, fy), (cx, cy) = np.asarray(self.focal_px), np.asarray(self.principal_point_px)
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.asarray(self.distortion, np.float64)
+
+    def camera(self) -> Geometry:
+        """The term with the lens alone: camera coordinates are the panel's."""
+        return Geometry(self.focal_px, self.principal_point_px, self.distortion, np.zeros(3), np.zeros(3))
 
 
 @final
@@ -112,7 +135,7 @@ def camera_matrix(intrinsics: Intrinsics) -> Float[np.ndarray, "3 3"]:
 class Bundle:
     """Intrinsics and one pose per view."""
 
-    intrinsics: Intrinsics
+    intrinsics: Lens
     poses: Poses
 
     def facing(self) -> Bundle:
@@ -167,14 +190,13 @@ class Points:
 
 
 def projected(
-    intrinsics: Intrinsics, camera: Float[np.ndarray, "n 3"]
+    intrinsics: Lens, camera: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 15"]]:
     """Places of points in camera coordinates (any unit), in px (``cv2.projectPoints``).
 
     The second result has their derivatives by the 9 intrinsics, a small turn (rad) and a shift of the points.
     """
-    lens = camera_matrix(intrinsics), intrinsics[4:]
-    places, slopes = cv2.projectPoints(camera, np.zeros(3), np.zeros(3), *lens)
+    places, slopes = cv2.projectPoints(camera, np.zeros(3), np.zeros(3), *Intrinsics.of(intrinsics).opencv)
     by = slopes.reshape(-1, 2, 15)
     return places.reshape(-1, 2), np.concatenate([by[..., 6:], by[..., :6]], axis=2)
 

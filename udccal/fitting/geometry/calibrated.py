@@ -27,7 +27,6 @@ from udccal.fitting.geometry.bundle import (
     Points,
     Poses,
     Solved,
-    camera_matrix,
     in_sigma,
     projected,
 )
@@ -52,7 +51,7 @@ class CalibratedViews:
     """Intrinsics and poses with their uncertainty, and tests of them.
 
     Attributes:
-        intrinsics: in the order of ``INTRINSIC_NAMES``; those that the data do not ask for are 0, and not ``free``.
+        intrinsics: the lens; distortion coefficients that the data do not ask for are 0, and not ``free``.
         poses: of the views in use, board to camera: rotation vector (rad), then translation (board's unit).
         cov: of the intrinsics as a vector, then 6 per view in use. The scale of the noise is estimated; where the views
             disagree beyond it, the variance of their disagreement is added.
@@ -118,10 +117,9 @@ class CalibratedViews:
         self, pixels: Float[np.ndarray, "rays 2"]
     ) -> tuple[Float[np.ndarray, "rays 2 9"], Float[np.ndarray, "rays 2 3"]]:
         """Derivatives of the places where rays land, by the intrinsics and by a small rotation of the rays."""
-        lens = camera_matrix(self.intrinsics), self.intrinsics[4:]
         enough = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-9
-        ideal = cv2.undistortPoints(pixels, *lens, criteria=enough)
-        places, by = projected(self.intrinsics, cv2.convertPointsToHomogeneous(ideal).reshape(-1, 3))
+        ideal = cv2.undistortPoints(pixels, *self.intrinsics.opencv, criteria=enough)
+        places, by = projected(self.intrinsics.vector, cv2.convertPointsToHomogeneous(ideal).reshape(-1, 3))
         near = np.abs(places - pixels).max(axis=1) < 1e-6
         lost = ~near | (np.linalg.det(np.where(near[:, None, None], by[:, :, LENS + 3 : LENS + 5], 0.0)) <= 0)
         if lost.any():
@@ -230,7 +228,7 @@ def _status(found: CalibratedViews) -> tuple[FitStatus, tuple[str, ...]]:
             f"(RMS): no lens puts these board points there. {order}",
         )
     width = found.image_size[0]
-    sigma = np.sqrt(np.diag(found.cov))[:4] / [*np.abs(found.intrinsics[:2]), width, width]
+    sigma = np.sqrt(np.diag(found.cov))[:4] / [*np.abs(found.intrinsics.focal_px), width, width]
     if sigma.max() > rules.most_uncertain:
         what = "focal length" if sigma.argmax() < 2 else "centre of the picture"
         return FitStatus.TOO_FEW_DATA, (

@@ -22,7 +22,7 @@ from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.geometry.bundle import RULES, GeometryRules, Intrinsics, Points, Poses, camera_matrix, intrinsics_of
+from udccal.fitting.geometry.bundle import RULES, GeometryRules, Intrinsics, Lens, Points, Poses
 from udccal.fitting.geometry.corners import BoardCorners, Picture, detect_corners
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.wire.data import read_wire
@@ -104,7 +104,7 @@ def rig_prior(rig: RigDescription) -> Prior:
     """
     focal = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
     sigma = [*[focal] * 2, *[0.01 * rig.camera.columns] * 2, 0.2, 0.2, 1e-3, 1e-3, 0.1]
-    return Prior.independent(intrinsics_of(nominal_geometry(rig)), np.array(sigma))
+    return Prior.independent(Intrinsics.of_geometry(nominal_geometry(rig)).vector, np.array(sigma))
 
 
 def flat_field(
@@ -223,9 +223,9 @@ def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarr
     return ""
 
 
-def best_poses(points: Points, intrinsics: Intrinsics) -> tuple[Poses, Poses]:
+def best_poses(points: Points, intrinsics: Lens) -> tuple[Poses, Poses]:
     """The best pose of each view at these intrinsics, and the one mirrored at the line of sight."""
-    lens = camera_matrix(intrinsics), intrinsics[4:]
+    lens = Intrinsics.of(intrinsics).opencv
     pairs = np.array([_pose_pair(points, view, *lens) for view in range(len(points.names))]).reshape(-1, 2, 6)
     return pairs[:, 0], pairs[:, 1]
 

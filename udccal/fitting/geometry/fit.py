@@ -20,7 +20,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
-from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, RULES, Bundle, GeometryRules, centred, lens_alone
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, RULES, GeometryRules, Intrinsics, Lens, Poses
 from udccal.fitting.geometry.calibrated import CalibratedViews, folded, turn_with
 from udccal.fitting.geometry.data import BoardView, GeometryData, gather
 from udccal.fitting.geometry.views import calibrate_views, check_picture
@@ -71,7 +71,7 @@ def fit_geometry(
     """
     gathered = gather(board_points, image_points, sigmas, rules)
     check_picture(image_size, gathered.points)
-    lens = start or lens_alone(centred(float(max(image_size)), image_size))
+    lens = start or Intrinsics.centred(float(max(image_size)), image_size).camera()
     try:
         views = calibrate_views(gathered, image_size, start, prior)
     except FitError as error:
@@ -208,7 +208,7 @@ def _result(
     A pattern in the residuals is modelled as an error of the principal point, which moves every place by its size.
     """
     still, rotation = (range(len(bundle.poses)), Rotation.identity()) if on_jig is None else (on_jig, None)
-    x, cov = with_angles(bundle, bundle.cov, still, rotation)
+    x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, still, rotation)
     points, use, count = bundle.points, bundle.points.used, len(_NAMES) if on_jig else LENS
     factor = np.hstack([square_root(cov), bundle.pattern_px * np.eye(len(x))[:, 2:4]])
     posterior = Posterior(x, factor, partial(term_at, pupil=pupil_mm))
@@ -247,26 +247,31 @@ def _result(
 
 
 def with_angles(
-    place: Bundle | CalibratedViews, cov: Float[np.ndarray, "n n"], views: Sequence[int], turn: Rotation | None = None
+    intrinsics: Lens,
+    poses: Poses,
+    cov: Float[np.ndarray, "n n"],
+    views: Sequence[int],
+    turn: Rotation | None = None,
 ) -> tuple[Float[np.ndarray, "12"], Float[np.ndarray, "12 12"]]:
     """The argument of ``term_at``, and its covariance; the camera's axes turn with the boards of some views.
 
     Args:
-        place, cov: intrinsics and poses; covariance of all of them, one after another.
+        intrinsics, poses: of a bundle.
+        cov: of all of them, one after another.
         views: their boards are at rest.
         turn: of the camera against these boards; without it they have the panel's axes, in the mean.
     """
-    turn = Rotation.from_rotvec(-place.poses[views, :3]).mean() if turn is None else turn
+    turn = Rotation.from_rotvec(-poses[views, :3]).mean() if turn is None else turn
     near = [Rotation.from_rotvec(step) for step in 1e-5 * np.vstack([np.eye(3), -np.eye(3), np.zeros((1, 3))])]
     angles = np.array([angles_deg((turn * step).as_rotvec()) for step in near])
     slope = (angles[:3] - angles[3:6]).T / 2e-5
-    picks = np.vstack([np.eye(LENS, len(cov)), -slope @ turn_with(place.poses, views)])
-    return np.append(place.intrinsics, angles[6]), picks @ cov @ picks.T
+    picks = np.vstack([np.eye(LENS, len(cov)), -slope @ turn_with(poses, views)])
+    return np.append(intrinsics, angles[6]), picks @ cov @ picks.T
 
 
 def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
     """The term of ``x``: intrinsics, tilt, roll and yaw in degrees; ``pupil`` in mm in panel coordinates."""
-    return replace(lens_alone(x), rotation_rad=turned_by(x[LENS:]), pupil_mm=pupil)
+    return replace(Intrinsics.of(x).camera(), rotation_rad=turned_by(x[LENS:]), pupil_mm=pupil)
 
 
 def _outliers(bundle: CalibratedViews, views: list[BoardView]) -> tuple[tuple[Outliers, ...], tuple[str, ...]]:

@@ -28,11 +28,10 @@ from udccal.fitting.geometry.bundle import (
     Bundle,
     BundleProblem,
     Free,
+    Intrinsics,
     Points,
     Poses,
     Solved,
-    centred,
-    intrinsics_of,
     linearised,
     solve,
 )
@@ -88,7 +87,7 @@ def calibrate_views(
     pattern, pattern_px = residual_pattern(solved, points, image_size, final.dof)
     places = (f"view {points.names[points.view[k]]}, point {points.index[k]}" for k in np.flatnonzero(~points.used))
     views = CalibratedViews(
-        intrinsics=bundle.intrinsics,
+        intrinsics=Intrinsics.of(bundle.intrinsics),
         poses=bundle.poses,
         cov=cov if between is None else cov + between,
         points=points,
@@ -110,8 +109,8 @@ def calibrate_views(
 
 def starts(points: Points, size: tuple[int, int], given: Geometry | None, poses: Poses | None) -> list[Bundle]:
     """Starts: from the given intrinsics, and from the views' vanishing points or else a common lens."""
-    lenses = [] if given is None else [intrinsics_of(given)]
-    lenses.append(centred(_focal_px(points, size), size))
+    lenses = [] if given is None else [Intrinsics.of_geometry(given).vector]
+    lenses.append(Intrinsics.centred(_focal_px(points, size), size).vector)
     found = [Bundle(lens, best_poses(points, lens)[0]) for lens in lenses]
     if poses is not None:
         found[0] = replace(found[0], poses=np.asarray(poses, dtype=np.float64)[list(points.names)])
