@@ -32,7 +32,8 @@ from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.effort import FitEffort
 from udccal.fitting.backscatter.fit import fit_backscatter
-from udccal.fitting.backscatter.read import read_backscatter, sampled_rays
+from udccal.fitting.backscatter.model import sampled_rays
+from udccal.fitting.backscatter.read import read_backscatter
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.start import read_psf

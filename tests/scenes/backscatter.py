@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import BackscatterData, Binned
-from udccal.fitting.backscatter.model import window_for
+from udccal.fitting.backscatter.model import grid_rays, grid_step, window_for
 from udccal.fitting.backscatter.parameters import (
     TWO_PLANES,
     BackscatterRules,
@@ -21,7 +21,7 @@ from udccal.fitting.backscatter.parameters import (
     values_of,
     with_linear,
 )
-from udccal.fitting.backscatter.read import grid_rays, grid_step, visible_crop
+from udccal.fitting.backscatter.read import visible_crop
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import Backscatter, panel_response, response_grid

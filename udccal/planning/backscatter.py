@@ -16,9 +16,9 @@ from udccal.arrangements import Dark, PanelPicture
 from udccal.bins import Bins
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import Binned, Profile
-from udccal.fitting.backscatter.model import PerBin, Pictures, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.model import PerBin, Pictures, grid_step, ratios_and_jacobian, sampled_rays, window_for
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, linear_slope, prior_of, vector_of
-from udccal.fitting.backscatter.read import grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.read import visible_crop
 from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.numerics import in_float64

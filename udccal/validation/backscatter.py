@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udccal.fitting.backscatter.data import BackscatterData, Binned
-from udccal.fitting.backscatter.model import PerShot, Usable, ratios
+from udccal.fitting.backscatter.model import PerShot, Usable, grid_rays, ratios
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, vector_of
-from udccal.fitting.backscatter.read import grid_rays, read_backscatter
+from udccal.fitting.backscatter.read import read_backscatter
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile

@@ -14,7 +14,7 @@ from scipy.special import ndtri
 
 from udccal.bins import Bins
 from udccal.cfa import cfa_named
-from udccal.fitting.backscatter.read import grid_step
+from udccal.fitting.backscatter.model import grid_step
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.noise.data import NoiseRules, read_noise
 from udccal.fitting.noise.frame_moments import stacked

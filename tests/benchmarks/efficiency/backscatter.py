@@ -26,6 +26,7 @@ from tests.scenes.backscatter import (
 )
 from udccal.fitting.backscatter.data import BackscatterData
 from udccal.fitting.backscatter.fit import result_of
+from udccal.fitting.backscatter.model import grid_rays
 from udccal.fitting.backscatter.parameters import (
     NAMES,
     TWO_PLANES,
@@ -36,7 +37,6 @@ from udccal.fitting.backscatter.parameters import (
     prior_of,
 )
 from udccal.fitting.backscatter.posterior import TermAt, moments_along_reflection
-from udccal.fitting.backscatter.read import grid_rays
 from udccal.fitting.backscatter.solve import Problem, search
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter

@@ -15,8 +15,9 @@ from udccal.cfa import PATTERNS, Cfa, cfa_named
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import BackscatterData, Binned
 from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter.model import grid_step
 from udccal.fitting.backscatter.parameters import BackscatterRules
-from udccal.fitting.backscatter.read import binned, grid_step, read_backscatter, visible_crop
+from udccal.fitting.backscatter.read import binned, read_backscatter, visible_crop
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter, backscatter_rate

@@ -13,8 +13,11 @@ from udccal.fitting.backscatter.model import (
     PanelCrop,
     Pictures,
     Shares,
+    directions,
+    grid_step,
     ratios,
     ratios_and_jacobian,
+    sampled_rays,
     window_for,
 )
 from udccal.fitting.backscatter.parameters import (
@@ -30,7 +33,7 @@ from udccal.fitting.backscatter.parameters import (
     vector_of,
     with_linear,
 )
-from udccal.fitting.backscatter.read import directions, grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.read import visible_crop
 from udccal.fitting.backscatter.solve import Fitted, typical_error
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import emitter_shares, panel_response, response_grid, window_corners

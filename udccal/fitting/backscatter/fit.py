@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from udccal.arguments import check_kind
 from udccal.errors import FitError
 from udccal.fitting.backscatter.data import BackscatterData, Binned
-from udccal.fitting.backscatter.model import Usable, window_for
+from udccal.fitting.backscatter.model import Usable, grid_step, window_for
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
     DISTANCE,
@@ -23,7 +23,6 @@ from udccal.fitting.backscatter.parameters import (
     values_of,
 )
 from udccal.fitting.backscatter.posterior import Misfits, TermAt, linear_cov, scaled, value_moments
-from udccal.fitting.backscatter.read import grid_step
 from udccal.fitting.backscatter.solve import BAD_BINS, BAD_PICTURES, Found, Problem, search
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers

@@ -1,4 +1,4 @@
-"""Light of pictures over that of white at sensor positions, and its derivatives by the parameters.
+"""Positions on the sensor; the light of pictures over that of white there, and its derivatives by the parameters.
 
 This is ``udccal.models.backscatter`` in numpy: a fit needs it at few positions and for many parameters, for which
 compiling takes longer than computing. White is the first shot, the dark frame the last.
@@ -28,7 +28,10 @@ from udccal.fitting.backscatter.parameters import (
     Vector,
     emitters_of,
 )
+from udccal.fitting.wire.data import ideal_points
 from udccal.models.backscatter import Backscatter
+from udccal.models.geometry import Geometry
+from udccal.rig import RigDescription
 
 # Axes: shot, colour, position; bin: colour, position; Moves add the parameter. Rays are in panel coordinates.
 PerShot = Float[np.ndarray, "shots 3 n"]
@@ -39,6 +42,47 @@ Moves = Float[np.ndarray, "k shots 3 n"]
 _LEAST_WHITE = 1e-9
 # A window holds the soft edge up to this many of its sigmas; at so many it differs from 0 or 1 by 1e-12.
 _WINDOW_SIGMAS, _EDGE_SIGMAS = 4.0, 7.0
+
+
+def grid_step(rig: RigDescription) -> int:
+    """Return the grid's spacing in sensor px: even, about an eighth of the rows' period, with a small remainder."""
+    camera = rig.camera
+    period = rig.panel.pitch_mm.value / rig.mounting.standoff_mm.value * rig.focal_px
+    largest = max(4, int(period / 8))
+    choices = range(2 * (largest // 2), max(2, int(0.6 * largest)), -2)
+    return min(choices, key=lambda step: camera.columns % step + camera.rows % step)
+
+
+def sampled_rays(geometry: Geometry, rig: RigDescription, step: int, count: int) -> tuple[Rays, Int[np.ndarray, " n"]]:
+    """Spread about ``count`` positions evenly over the grid (Roberts's R2 sequence, of the plastic number).
+
+    Args:
+        geometry, rig: give the rays of pixels and the sensor's size.
+        step: spacing of the grid in sensor px.
+        count: number of positions wanted; those that coincide are merged.
+
+    Returns:
+        rays in panel coordinates, and flat grid indices in rising order.
+    """
+    shape = rig.camera.rows // step, rig.camera.columns // step
+    plastic = 1.32471795724474602596
+    sequence = (0.5 + np.arange(count)[:, None] / np.array([plastic, plastic**2])) % 1.0
+    columns, rows = (sequence * shape[::-1]).astype(int).T
+    flat = np.unique(rows * shape[1] + columns)
+    return grid_rays(geometry, shape, step, flat), flat
+
+
+def grid_rays(geometry: Geometry, shape: tuple[int, int], step: int, flat: Int[np.ndarray, " n"]) -> Rays:
+    """Return the rays, in panel coordinates, of positions of a grid of ``shape`` (rows, columns), by flat index."""
+    rows, columns = np.divmod(flat, shape[1])
+    return directions(geometry, step * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)
+
+
+def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Rays:
+    """Return the rays of sensor pixels in panel coordinates, as ``models.geometry.panel_directions`` does."""
+    ideal = ideal_points(geometry, pixels)
+    rays = np.insert(ideal, 2, 1.0, axis=1) @ Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).as_matrix().T
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 class _Footprints(NamedTuple):

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
 from udccal.fitting.backscatter.data import BackscatterData, Profile
-from udccal.fitting.backscatter.model import Rays, ratios, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.model import Rays, grid_rays, ratios, ratios_and_jacobian, window_for
 from udccal.fitting.backscatter.parameters import (
     LOGARITHMIC,
     REFLECTION,
@@ -31,7 +31,6 @@ from udccal.fitting.backscatter.parameters import (
     values_of,
     with_linear,
 )
-from udccal.fitting.backscatter.read import grid_rays
 from udccal.fitting.backscatter.solve import Found
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_sigma, f_tail, group_means_test, sharper

@@ -1,4 +1,4 @@
-"""From a session to the data of the backscatter fit: the grid of the bins, and the rays of positions on it."""
+"""From a session to the data of the backscatter fit."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from collections.abc import Iterable
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float
 
 from udccal.bins import Bins
 from udccal.fitting.backscatter.data import BackscatterData, Binned
-from udccal.fitting.backscatter.model import PanelCrop, Rays, corners_of
+from udccal.fitting.backscatter.model import PanelCrop, corners_of, directions, grid_step
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.nominal import nominal_backscatter
-from udccal.fitting.wire.data import ideal_points
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, linear_signal, variance_e
 from udccal.rig import RigDescription
@@ -92,15 +90,6 @@ def binned(
     return Binned.joined(shots)
 
 
-def grid_step(rig: RigDescription) -> int:
-    """Return the grid's spacing in sensor px: even, about an eighth of the rows' period, with a small remainder."""
-    camera = rig.camera
-    period = rig.panel.pitch_mm.value / rig.mounting.standoff_mm.value * rig.focal_px
-    largest = max(4, int(period / 8))
-    choices = range(2 * (largest // 2), max(2, int(0.6 * largest)), -2)
-    return min(choices, key=lambda step: camera.columns % step + camera.rows % step)
-
-
 def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     """Return the part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
 
@@ -116,35 +105,3 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     first = np.clip(middle.min(axis=0) - room_px, 0, [panel.columns - 8, panel.rows - 8])
     last = np.clip(middle.max(axis=0) + room_px + 1, first + 8, [panel.columns, panel.rows])
     return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
-
-
-def sampled_rays(geometry: Geometry, rig: RigDescription, step: int, count: int) -> tuple[Rays, Int[np.ndarray, " n"]]:
-    """Spread about ``count`` positions evenly over the grid (Roberts's R2 sequence, of the plastic number).
-
-    Args:
-        geometry, rig: give the rays of pixels and the sensor's size.
-        step: spacing of the grid in sensor px.
-        count: number of positions wanted; those that coincide are merged.
-
-    Returns:
-        rays in panel coordinates, and flat grid indices in rising order.
-    """
-    shape = rig.camera.rows // step, rig.camera.columns // step
-    plastic = 1.32471795724474602596
-    sequence = (0.5 + np.arange(count)[:, None] / np.array([plastic, plastic**2])) % 1.0
-    columns, rows = (sequence * shape[::-1]).astype(int).T
-    flat = np.unique(rows * shape[1] + columns)
-    return grid_rays(geometry, shape, step, flat), flat
-
-
-def grid_rays(geometry: Geometry, shape: tuple[int, int], step: int, flat: Int[np.ndarray, " n"]) -> Rays:
-    """Return the rays, in panel coordinates, of positions of a grid of ``shape`` (rows, columns), by flat index."""
-    rows, columns = np.divmod(flat, shape[1])
-    return directions(geometry, step * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)
-
-
-def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Rays:
-    """Return the rays of sensor pixels in panel coordinates, as ``models.geometry.panel_directions`` does."""
-    ideal = ideal_points(geometry, pixels)
-    rays = np.insert(ideal, 2, 1.0, axis=1) @ Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).as_matrix().T
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -22,9 +22,11 @@ from udccal.fitting.backscatter.model import (
     Rays,
     Shares,
     Usable,
+    grid_step,
     ratios,
     ratios_and_jacobian,
     ratios_of,
+    sampled_rays,
     window_for,
 )
 from udccal.fitting.backscatter.parameters import (
@@ -47,7 +49,6 @@ from udccal.fitting.backscatter.parameters import (
     prior_of,
     values_of,
 )
-from udccal.fitting.backscatter.read import grid_step, sampled_rays
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.misfit import chi2_test, excess_sigma, robust_excess_sigma
 from udccal.fitting.engine.orders import Attempt, Choice, choose, evidence
