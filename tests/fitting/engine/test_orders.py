@@ -88,3 +88,9 @@ def test_what_the_data_hardly_determine_keeps_the_doubt_of_the_orders_above() ->
     assert choice.spread(1000, lambda own: np.zeros(1), cov=lambda own: np.full((1, 1), own))[0, 0] == pytest.approx(
         9.0 * weight
     )
+
+
+def test_an_order_above_that_seems_to_know_more_takes_no_variance_off() -> None:
+    choice = choose([Attempt("without", 0, 0.0, 9.0), Attempt("with", 1, bic(0.0, 1.0, 1000), 1.0)])
+    found = choice.spread(1000, lambda own: np.zeros(2), cov=lambda own: np.diag([own, 2.0]))
+    np.testing.assert_allclose(found, 0.0, atol=1e-12)

@@ -86,8 +86,15 @@ class Choice(Generic[Fit]):
             above = [
                 (w, one) for w, one in zip(weight, self.tried, strict=True) if one.parameters > self.best.parameters
             ]
-            found = found + sum(w * (cov(one.fit) - own) for w, one in above)
+            found = found + sum(w * _growth(own, cov(one.fit)) for w, one in above)
         return found
+
+
+def _growth(own: Float[np.ndarray, "values values"], more: Float[np.ndarray, "values values"]) -> np.ndarray:
+    """The part of ``more`` less ``own`` that is a covariance: an order above at another place may know more there."""
+    size = np.sqrt(np.maximum(np.maximum(np.diag(own), np.diag(more)), 1e-300))
+    values, vectors = np.linalg.eigh((more - own) / np.outer(size, size))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size))
 
 
 def choose(tried: Iterable[Attempt[Fit]]) -> Choice[Fit]:
