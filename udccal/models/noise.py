@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -50,6 +51,8 @@ def electrons(noise: Noise, signal_DN: Float[Arrayish, "*n"]) -> Float[Array, "*
     return jnp.asarray(linear_signal(jnp.asarray(signal_DN) - noise.black_DN, noise.bend_per_DN) / noise.K_DN_per_e)
 
 
+# One compilation instead of one per operation.
+@jax.jit
 def variance_e(noise: Noise, signal_e: Float[Arrayish, "*n"], exposure_s: Float[Arrayish, ""]) -> Float[Array, "*n"]:
     """Return the temporal variance of samples in e-^2.
 

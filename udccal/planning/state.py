@@ -32,7 +32,6 @@ WHITE = np.array([0.6, 1.0, 0.7])
 _DISTORTION = (-0.07, 0.035, 0.0, 0.0, -0.005)
 # Shading is smooth; the modulation by the rows hardly changes the number of electrons.
 _FIELD_GRID = (49, 65)
-_variance_e = jax.jit(variance_e)
 _wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 
 
@@ -109,7 +108,7 @@ class RigState:
     @in_float64
     def variance_e(self, signal_e: Float[np.ndarray, "*n"], exposure_s: float) -> Float[np.ndarray, "*n"]:
         """Temporal variance of single samples in e-^2; see ``models.noise.variance_e``."""
-        return np.asarray(_variance_e(self.noise, signal_e, exposure_s))
+        return np.asarray(variance_e(self.noise, signal_e, exposure_s))
 
 
 def nominal_state(rig: RigDescription) -> RigState:

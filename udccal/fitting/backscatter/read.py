@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -18,9 +17,6 @@ from udccal.models.noise import Noise, linear_signal, variance_e
 from udccal.rig import RigDescription
 from udccal.sessions.schema import DarkSubject, PanelSubject
 from udccal.sessions.store import Average, Session
-
-# One compilation instead of one per operation.
-_variance_e = jax.jit(variance_e)
 
 
 def read_backscatter(
@@ -75,7 +71,7 @@ def binned(
         signal_e = linear_signal(average.mean - black_DN, bend_per_DN) / gain
         clipped = average.mean >= most * saturation_DN
         # Variance in the dark, e-^2: of a row's offset, and of each sample independently.
-        rest_e2 = max(float(np.asarray(_variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
+        rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
         expected = np.maximum(signal_e, 0.0) + rest_e2
         shots.append(
             Binned(

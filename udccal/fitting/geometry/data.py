@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import cv2
-import jax
 import numpy as np
 from jaxtyping import Bool
 
@@ -32,8 +31,6 @@ from udccal.result import Outliers
 from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, StoredCapture
 from udccal.sessions.store import Session
-
-_variance_e = jax.jit(variance_e)
 
 
 @final
@@ -140,7 +137,7 @@ def _corners(
         float(np.asarray(one)) for one in (noise.black_DN, noise.saturation_DN, noise.bend_per_DN, noise.K_DN_per_e)
     )
     light = linear_signal(mean.astype(np.float64) - black, bend)
-    temporal_e2 = np.asarray(_variance_e(noise, light / gain, np.float64(capture.exposure_s)), dtype=np.float64)
+    temporal_e2 = np.asarray(variance_e(noise, light / gain, np.float64(capture.exposure_s)), dtype=np.float64)
     variance = gain**2 * (temporal_e2 / capture.frames + float(np.asarray(noise.DSNU1288_e)) ** 2)
     area = capture.region
     part = np.s_[area.y : area.y + area.rows, area.x : area.x + area.columns]
