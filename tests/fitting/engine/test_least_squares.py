@@ -11,7 +11,7 @@ import pytest
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.least_squares import LOG, Blocks, SolverRules, Step, minimise
+from udccal.fitting.engine.least_squares import LOG, Blocks, SolverRules, Step, minimise, solve
 
 Errors = Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " m"]]
 
@@ -207,3 +207,9 @@ def test_a_descent_that_was_stopped_has_the_way_left_in_its_error_bars(steps: in
     assert np.all(np.abs(off) < 4.5 * np.sqrt(np.diag(cov)))
     ended = minimise(Curve(rosenbrock), np.array([-1.2, 1.0]), SolverRules(least_gain=1e-12))
     assert ended.with_rest(known) == pytest.approx(known, abs=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_parameters_without_information_of_their_own_stay() -> None:
+    matrix = np.array([[1e20, 0.0, 0.0], [0.0, 0.0, 1e10], [0.0, 1e10, 0.0]])
+    assert solve(matrix, np.array([2e20, 0.0, 0.0])) == pytest.approx([2.0, 0.0, 0.0])

@@ -211,7 +211,9 @@ def solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> F
 
     Directions that the matrix does not determine are zero.
     """
-    unit = 1 / np.sqrt(np.maximum(np.diag(matrix), _TINY))
+    size = np.diag(matrix)
+    # Without a unit a row is zero, and the matrix has no root.
+    unit = np.where(size > _TINY, 1 / np.sqrt(np.maximum(size, _TINY)), 0.0)
     try:
         root = np.linalg.cholesky(matrix * np.outer(unit, unit))
     except np.linalg.LinAlgError:

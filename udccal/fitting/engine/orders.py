@@ -92,9 +92,12 @@ class Choice(Generic[Fit]):
 
 def _growth(own: Float[np.ndarray, "values values"], more: Float[np.ndarray, "values values"]) -> np.ndarray:
     """The part of ``more`` less ``own`` that is a covariance: an order above at another place may know more there."""
-    size = np.sqrt(np.maximum(np.maximum(np.diag(own), np.diag(more)), 1e-300))
-    values, vectors = np.linalg.eigh((more - own) / np.outer(size, size))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size))
+    size = np.maximum(np.diag(own), np.diag(more))
+    # What has no variance in either order has no part in it.
+    unit = np.where(size > 0, 1 / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)
+    values, vectors = np.linalg.eigh((more - own) * np.outer(unit, unit))
+    root = vectors * np.sqrt(np.maximum(values, 0.0)) * np.sqrt(np.maximum(size, 0.0))[:, None]
+    return np.asarray(root @ root.T)
 
 
 def choose(tried: Iterable[Attempt[Fit]]) -> Choice[Fit]:
