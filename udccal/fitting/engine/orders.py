@@ -14,6 +14,7 @@ from typing import Generic, TypeVar, final
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.engine.gaussian import square_root
 from udccal.result import Candidate
 
 Fit = TypeVar("Fit")
@@ -83,21 +84,12 @@ class Choice(Generic[Fit]):
         found = np.asarray((away.T * weight) @ away)
         if cov is not None:
             own = cov(self.best.fit)
-            above = [
-                (w, one) for w, one in zip(weight, self.tried, strict=True) if one.parameters > self.best.parameters
-            ]
-            found = found + sum(w * _growth(own, cov(one.fit)) for w, one in above)
+            for w, one in zip(weight, self.tried, strict=True):
+                if one.parameters > self.best.parameters:
+                    # The part that is a covariance: at another place an order above may know more.
+                    root = square_root(cov(one.fit) - own)
+                    found = found + w * root @ root.T
         return found
-
-
-def _growth(own: Float[np.ndarray, "values values"], more: Float[np.ndarray, "values values"]) -> np.ndarray:
-    """The part of ``more`` less ``own`` that is a covariance: an order above at another place may know more there."""
-    size = np.maximum(np.diag(own), np.diag(more))
-    # What has no variance in either order has no part in it.
-    unit = np.where(size > 0, 1 / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)
-    values, vectors = np.linalg.eigh((more - own) * np.outer(unit, unit))
-    root = vectors * np.sqrt(np.maximum(values, 0.0)) * np.sqrt(np.maximum(size, 0.0))[:, None]
-    return np.asarray(root @ root.T)
 
 
 def choose(tried: Iterable[Attempt[Fit]]) -> Choice[Fit]:
