@@ -25,6 +25,8 @@ from udccal.models.wire import Wire
 _PLACES = 64
 _Vector = Float[np.ndarray, " n"]
 _Cov = Float[np.ndarray, "n n"]
+# See ``_relative``.
+_Relative = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]
 
 
 def _grid(geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]) -> Pixels:
@@ -137,10 +139,10 @@ def misfits(
     """All that residuals show; ``variance`` is that of the fit's residuals in units of the noise's."""
     # Columns and rows of the sensor, each by the place of its pixels.
     sides = (np.unique(side, return_inverse=True)[1] for side in tested.pixels.scaled.T)
-    columns, rows = (_of_means(tested, side, statistical, held_out) for side in sides)
+    relative = values, weight, scale = _relative(tested)
+    columns, rows = (_of_means(relative, side, statistical, held_out) for side in sides)
     test = sharper(columns.test, rows.test)
     lines = Misfit(float(np.hypot(columns.sigma, rows.sigma)) if test.found else 0.0, test)
-    values, weight, scale = _relative(tested)
     beyond = float(np.sum(values**2)) / max(int(np.count_nonzero(weight)), 1) * max(1 - 1 / scale, 0.0)
     excess = float(np.sqrt(beyond)) if variance > rules.worst_variance else 0.0
     return Misfits(misfit(tested, wire, statistical, held_out), lines, excess)
@@ -154,7 +156,8 @@ def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: boo
     """
     # Bins of a period of the rows and of the columns, once finer in the one, once in the other.
     binned = (_bins(tested.pixels, wire, down, across) for down, across in ((12, 3), (3, 12)))
-    found = [_of_means(tested, bins, statistical, held_out) for bins in binned]
+    relative = _relative(tested)
+    found = [_of_means(relative, bins, statistical, held_out) for bins in binned]
     test = sharper(*(one.test for one in found))
     return Misfit(min(found, key=lambda one: one.test.p_value).sigma if test.found else 0.0, test)
 
@@ -168,7 +171,7 @@ def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.n
     return np.asarray((tile_numbers(pixels.scaled) * down + y) * across + x)
 
 
-def _relative(tested: Weighed) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
+def _relative(tested: Weighed) -> _Relative:
     """Residuals relative to the expected signal, their weights, and their variance in units of the noise's."""
     pixels, expected = tested.pixels, tested.expected
     used = (pixels.weight > 0) & (expected > 0)
@@ -178,9 +181,9 @@ def _relative(tested: Weighed) -> tuple[Float[np.ndarray, " n"], Float[np.ndarra
     return values, weight, max(scale, LEAST_VARIANCE)
 
 
-def _of_means(tested: Weighed, group: Int[np.ndarray, " n"], statistical: float, held_out: bool) -> Misfit:
+def _of_means(relative: _Relative, group: Int[np.ndarray, " n"], statistical: float, held_out: bool) -> Misfit:
     """Test the means of groups of pixels against chance; see ``misfit``."""
-    values, weight, scale = _relative(tested)
+    values, weight, scale = relative
     full = np.bincount(group, weight > 0) >= 4
     total = np.bincount(group, weight)[full]
     mean = np.bincount(group, weight * values)[full] / total
