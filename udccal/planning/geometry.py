@@ -117,7 +117,7 @@ class BoardViews:
         return BundleProblem(points, EVERY).equations_at(Bundle(self.intrinsics, view.pose[None])).marginal()[0]
 
     def _window_px(self, spec: BoardSpec, depth_mm: float) -> float:
-        square_px = spec.square_mm / depth_mm * Intrinsics.of(self.intrinsics).focal_px[0]
+        square_px = spec.square_mm / depth_mm * float(np.asarray(self._state.geometry.focal_px)[0])
         return float(np.clip(_WINDOW_SQUARES * square_px, *RULES.window_px))
 
     def _inside(self, pixels: Float[np.ndarray, "n 2"], margin: float) -> Bool[np.ndarray, " n"]:
