@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, flat_noise, sample_pixels, weighed
+from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, flat_noise, sample_pixels, tile_numbers, weighed
 from udccal.fitting.wire.jacobian import values_at, wire_derivatives
 from udccal.fitting.wire.parameters import shape_vector, with_shape
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
-from udccal.validation.flats import CELLS, cell_medians, cell_numbers, light_design
+from udccal.validation.flats import CELLS, cell_medians, light_design
 
 # Rotation (3), stand-off, offset (2) as in ``shape_vector``, and the focal length.
 POSE, _FOCAL = 6, 6
@@ -78,7 +78,7 @@ def pose_change(wire: Wire, data: WireData) -> PoseChange:
 
 
 def _without(pixels: Pixels, odd: Bool[np.ndarray, "down across"]) -> Pixels:
-    return replace(pixels, place=np.where(odd.ravel()[cell_numbers(pixels.scaled)], -1, pixels.place))
+    return replace(pixels, place=np.where(odd.ravel()[tile_numbers(pixels.scaled, CELLS)], -1, pixels.place))
 
 
 def _step(

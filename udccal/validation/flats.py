@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from udccal.fitting.wire.data import FlatNoise, Weighed
+from udccal.fitting.wire.data import FlatNoise, Weighed, tile_numbers
 
 # Parts of the sensor, down and across; a part has a median where it has so many pixels.
 CELLS, _LEAST = (24, 32), 8
@@ -21,13 +21,6 @@ def light_design(scaled: Float[np.ndarray, "n 2"], site: Int[np.ndarray, " n"]) 
     x, y = scaled.T
     sites = np.eye(int(site.max()) + 1)[site]
     return np.column_stack([sites, x, y, x * x, x * y, y * y])
-
-
-def cell_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Return the number of each position's part of the sensor, row by row; positions are from -1 to 1."""
-    down, across = CELLS
-    x, y = (np.clip(((scaled[:, i] + 1) / 2 * n).astype(np.int64), 0, n - 1) for i, n in enumerate((across, down)))
-    return np.asarray(y * across + x)
 
 
 NO_PARTS = (
@@ -54,7 +47,7 @@ def part_medians(
     values: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], scaled: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "down across"], Float[np.ndarray, "down across"]]:
     """Return medians of values at positions from -1 to 1 by part of the sensor, and their sigma; NaN without pixels."""
-    cell = cell_numbers(scaled)
+    cell = tile_numbers(scaled, CELLS)
     order, ends = np.argsort(cell, kind="stable"), np.cumsum(np.bincount(cell, minlength=CELLS[0] * CELLS[1]))[:-1]
     found = [
         (float(np.median(one)), float(_OF_MEDIAN / np.sqrt(np.sum(1 / noisy)))) if len(one) >= _LEAST else (np.nan,) * 2

@@ -263,10 +263,10 @@ def scaled_places(pixels: Float[np.ndarray, "n 2"], shape: tuple[int, int]) -> F
     return 2 * pixels / (np.array(shape[::-1]) - 1.0) - 1
 
 
-def tile_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Number of the sensor's tile in which each position lies."""
-    x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(TILES[::-1]))
-    return np.asarray(y * TILES[1] + x)
+def tile_numbers(scaled: Float[np.ndarray, "n 2"], tiles: tuple[int, int] = TILES) -> Int[np.ndarray, " n"]:
+    """Number of the sensor's tile, of so many down and across, in which each position of [-1, 1] lies, row by row."""
+    x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(tiles[::-1]))
+    return np.asarray(y * tiles[1] + x)
 
 
 def odd_step(size: int, samples: int) -> int:
