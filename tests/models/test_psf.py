@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from udccal.models.diffraction import Diffraction, disc_autocorrelation, local_frame, slit_coefficients
+from udccal.models.diffraction import (
+    Diffraction,
+    barred_overlap,
+    disc_autocorrelation,
+    local_frame,
+    slit_coefficients,
+)
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.models.geometry import Geometry
 from udccal.models.interference import disc_overlap_coefficient
@@ -43,6 +49,9 @@ def true_field(truth: RigTruth) -> PsfField:
         pitch_mm=np.float64(panel.pitch_mm),
         openings=np.array([panel.column_open, panel.row_open]),
         depth_mm=np.float64(panel.depth_mm),
+        depth_ratio=np.float64(0.0),
+        bar_width=np.zeros(2),
+        bar_place=np.zeros(2),
         pupil_diameter_mm=np.float64(optics.pupil_diameter_mm),
         blur_px=np.float64(0.0),
         blur_growth=np.zeros(2),
@@ -83,6 +92,20 @@ def test_slits_against_a_sum(lag: float, order: int) -> None:
     both = open_at(y + lag / 2) & open_at(y - lag / 2)
     expected = (both * np.cos(2 * np.pi * order * y)).mean() / opened
     assert as_numpy(slit_coefficients)(np.array([lag]), opened, 3)[order, 0] == pytest.approx(expected, abs=3e-4)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.1, 0.31, 0.8, 1.05, -1.2])
+@pytest.mark.parametrize(("width", "place"), [(0.0, 0.1), (0.04, 0.1), (0.2, -0.25), (0.05, 0.0)])
+def test_slits_with_a_bar_against_a_sum(lag: float, width: float, place: float) -> None:
+    y, opened = (np.arange(20000) + 0.5) / 20000, 0.7
+
+    def open_at(at: np.ndarray) -> np.ndarray:
+        away = (at + 0.5) % 1 - 0.5
+        return (np.abs(away) < opened / 2) & ~(np.abs(away - place) < width / 2)
+
+    expected = (open_at(y + lag) & open_at(y)).mean() / (opened - width)
+    found = as_numpy(barred_overlap)(np.array([lag]), opened, width, place)[0]
+    assert found == pytest.approx(expected, abs=4e-4)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from udccal.io.exr import write_exr
 from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, profile_sha256
-from udccal.profiles.schema import PictureName, StoredProfile
+from udccal.profiles.schema import VERSION, PictureName, StoredProfile
 from udccal.profiles.store import (
     RIG_PROFILE,
     check_replaceable,
@@ -191,7 +191,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no profile.json": (lambda f: (f / PROFILE_NAME).unlink(), "found none"),
     "cut short": (lambda f: (f / PROFILE_NAME).write_bytes((f / PROFILE_NAME).read_bytes()[:500]), "to be JSON"),
     "not an object": (lambda f: (f / PROFILE_NAME).write_text("[1]"), "JSON object"),
-    "newer": (damaged(lambda d: d.update(version=7)), "newer version 7"),
+    "newer": (damaged(lambda d: d.update(version=VERSION + 1)), f"newer version {VERSION + 1}"),
     "another format": (damaged(lambda d: d.update(format="udccal-session")), "format 'udccal-profile'"),
     "unknown entry": (damaged(lambda d: d.update(extra=1)), "'extra'"),
     "missing entry": (damaged(lambda d: d.pop("rig")), "'rig'"),

@@ -3,7 +3,7 @@
 ``stored/version_3.zip`` is the calibration of a simulated rig of 96 x 72 pixels by the command of its time, without a
 board; one in so many residuals is kept. The udccal of version 4 has read it, given the psf's blur a growth and colours,
 and written ``stored/version_4.zip``; that of version 5 has read this one, given the response a bend, and written
-``stored/version_5.zip``.
+``stored/version_5.zip``, which that of version 6 has migrated.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from udccal.profiles.store import read_profile, write_profile
 from udccal.profiles.versions import JsonObject
 from udccal.result import FitStatus
 
-STORED: Final = {version: Path(__file__).parent / "stored" / f"version_{version}.zip" for version in (3, 4, 5)}
+STORED: Final = {version: Path(__file__).parent / "stored" / f"version_{version}.zip" for version in (3, 4, 5, 6)}
 # Of psf parameters, those that version 4 added.
 BLUR: Final = ("blur_growth", "blur_colour")
 
@@ -130,6 +130,10 @@ def test_what_came_later_is_as_it_was_meant_before(version: int, document: JsonO
     growth, colour = ([0.125, -0.0625], [0.03125, 0.0, -0.015625]) if version >= 4 else (np.zeros(2), np.zeros(3))
     np.testing.assert_array_equal(profile.psf.term.diffraction.blur_growth, growth)
     np.testing.assert_array_equal(profile.psf.term.diffraction.blur_colour, colour)
+    # Rows were as deep as columns, and no bar was in the openings.
+    assert not stored & {"diffraction.depth_ratio", "diffraction.bar_width", "diffraction.bar_place"}
+    for name in ("depth_ratio", "bar_width", "bar_place"):
+        assert not np.any(getattr(profile.psf.term.diffraction, name))
 
 
 def test_written_anew_it_is_the_same_profile_of_the_present_version(
@@ -179,7 +183,7 @@ def without(term: str, name: str) -> Callable[[JsonObject], object]:
 CHANGED: Final[dict[str, tuple[Callable[[JsonObject], object], str]]] = {
     "a future version": (lambda d: d.update(version=VERSION + 1), f"newer version {VERSION + 1}"),
     "a version without a number": (lambda d: d.update(version=None), "version number"),
-    "a later version than it is": (lambda d: d.update(version=VERSION), "nonlinearity|captures.steps"),
+    "a later version than it is": (lambda d: d.update(version=VERSION), "nonlinearity|captures.steps|depth_ratio"),
     "no term": (lambda d: d["terms"].pop("psf"), "'terms.psf'"),
     "no fit": (lambda d: d["terms"]["wire"].pop("fit"), "'terms.wire.fit'"),
     "no captures": (lambda d: d["terms"]["noise"]["fit"].pop("captures"), "captures"),

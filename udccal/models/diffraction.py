@@ -26,6 +26,8 @@ from udccal.models.geometry import Geometry, panel_directions, rotation_matrix
 from udccal.models.lattice import Frequencies
 
 _FINE_NM = 1.0
+# Bars narrower than this are none, in periods.
+_LEAST_BAR = 1e-3
 PUPIL_NODES = 4
 
 
@@ -36,6 +38,10 @@ class Diffraction(eqx.Module):
         pitch_mm: pitch of rows and columns.
         openings: open part of the (columns, rows) for a ray along the panel's normal.
         depth_mm: depth of the opaque structure; it narrows slits by depth * |tangent of the obliquity|.
+        depth_ratio: logarithm of the rows' depth over the columns', whose geometric mean is ``depth_mm``.
+        bar_width: width of an opaque bar through the openings of the (columns, rows) in periods, for a ray along the
+            normal; none below a thousandth. Its depth is theirs.
+        bar_place: distance of the bar's middle from the opening's, in periods; kernels do not tell its sign.
         pupil_diameter_mm: diameter of the entrance pupil.
         offset_periods: centre (X, Y) of the footprint of a ray along the normal, in periods from the middle of an
             opening, modulo 1.
@@ -52,6 +58,9 @@ class Diffraction(eqx.Module):
     pitch_mm: Float[Arrayish, ""]
     openings: Float[Arrayish, "2"]
     depth_mm: Float[Arrayish, ""]
+    depth_ratio: Float[Arrayish, ""]
+    bar_width: Float[Arrayish, "2"]
+    bar_place: Float[Arrayish, "2"]
     pupil_diameter_mm: Float[Arrayish, ""]
     offset_periods: Float[Arrayish, "2"]
     standoff_per_pitch: Float[Arrayish, ""]
@@ -61,6 +70,19 @@ class Diffraction(eqx.Module):
     blur_colour: Float[Arrayish, "3"]
     wavelengths_nm: Float[Arrayish, " nodes"]
     spectrum: Float[Arrayish, "3 nodes"]
+
+
+class Slits(eqx.Module):
+    """A period of (columns, rows) along a ray: its open part, and an opaque bar in it, which a width of 0 leaves out.
+
+    Attributes:
+        opened: width of the opening in periods, the bar included.
+        bar_width, bar_place: width of the bar, and distance of its middle from the opening's, in periods.
+    """
+
+    opened: Float[Arrayish, "2"]
+    bar_width: Float[Arrayish, "2"]
+    bar_place: Float[Arrayish, "2"]
 
 
 class LocalFrame(eqx.Module):
@@ -116,7 +138,7 @@ def average_transfer(
         disc_px: diameter of a round source on the sensor; 0 for a point.
     """
     fx, fy = lattice_frequencies(frame, lattice)
-    columns, rows = (table[0] for table in slits_of(model, open_fractions(model, frame), fx, fy, 0))
+    columns, rows = (table[0] for table in slits_of(model, slits_along(model, frame), fx, fy, 0))
 
     def add(
         total: Float[Array, "3 rows half"], anchor: tuple[Array, Array]
@@ -157,10 +179,15 @@ def lattice_frequencies(frame: LocalFrame, lattice: Frequencies) -> tuple[Float[
     return jnp.asarray(lattice.frequency_x) / scale[0], jnp.asarray(lattice.frequency_y) / scale[1]
 
 
-def open_fractions(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:
-    """Return the open part of (columns, rows) along the ray of ``frame``'s source, as ``model`` has it."""
-    shadow = model.depth_mm / model.pitch_mm * jnp.abs(frame.direction[:2] / frame.direction[2])
-    return jnp.clip(jnp.asarray(model.openings) - shadow, 0.02, 1.0)
+def slits_along(model: Diffraction, frame: LocalFrame) -> Slits:
+    """Return the period of ``model`` along the ray of ``frame``'s source: its openings narrow, and its bars widen."""
+    depth = model.depth_mm / model.pitch_mm * jnp.exp(model.depth_ratio * jnp.array([-0.5, 0.5]))
+    shadow = depth * jnp.abs(frame.direction[:2] / frame.direction[2])
+    opened, bar, place = (jnp.asarray(part) for part in (model.openings, model.bar_width, model.bar_place))
+    opened, bar = jnp.clip(opened - shadow, 0.02, 1.0), jnp.where(bar > _LEAST_BAR, bar + shadow, 0.0)
+    # Only what is inside the opening counts.
+    first, last = (jnp.clip(place + side * bar / 2, -opened / 2, opened / 2) for side in (-1.0, 1.0))
+    return Slits(opened, jnp.minimum(last - first, 0.9 * opened), (first + last) / 2)
 
 
 def relative_lag(
@@ -203,17 +230,37 @@ def slit_coefficients(
     return jnp.stack(made)
 
 
+def barred_overlap(
+    relative_lag: Float[Arrayish, "*n"],
+    opened: Float[Arrayish, "*#n"],
+    bar_width: Float[Arrayish, "*#n"],
+    bar_place: Float[Arrayish, "*#n"],
+) -> Float[Array, "*n"]:
+    """Return the open part of slits with an opaque bar times themselves moved by the lag in pitches; 1 at lag 0."""
+
+    def common(one: Float[Arrayish, "*#n"], other: Float[Arrayish, "*#n"], apart: Float[Array, "*n"]) -> Array:
+        # Two widths in periods, in the same period and in the next.
+        nearer = apart - jnp.floor(apart)
+        reach, most = (one + other) / 2.0, jnp.minimum(one, other)
+        return jnp.clip(reach - nearer, 0.0, most) + jnp.clip(reach - 1.0 + nearer, 0.0, most)
+
+    lag = jnp.asarray(relative_lag)
+    crossed = common(opened, bar_width, lag - bar_place) + common(opened, bar_width, lag + bar_place)
+    return (common(opened, opened, lag) - crossed + common(bar_width, bar_width, lag)) / (opened - bar_width)
+
+
 def slits_of(
-    model: Diffraction, opened: Float[Array, "2"], fx: Float[Array, " half"], fy: Float[Array, " rows"], highest: int
+    model: Diffraction, slits: Slits, fx: Float[Array, " half"], fy: Float[Array, " rows"], highest: int
 ) -> tuple[Float[Array, "orders half nodes"], Float[Array, "orders rows nodes"]]:
     """Return slit coefficients of columns and of rows, averaged over the light of each wavelength node.
 
     A node's light is a triangle as wide as its distance to its neighbours, summed in steps of about a nanometre. High
-    orders therefore smear into a continuum, as they do in daylight, without a node for every nanometre.
+    orders therefore smear into a continuum, as they do in daylight, without a node for every nanometre. Bars are in
+    order 0 alone: the others move a hundredth of the light, and a bar changes a part of that.
 
     Args:
         model: the diffraction term.
-        opened: open part of (columns, rows) along the source's ray.
+        slits: along the source's ray.
         fx: cycles per unit direction cosine along x, for the columns. fy: along y, for the rows.
         highest: highest Fourier order.
     """
@@ -225,11 +272,15 @@ def slits_of(
     fine = nodes[:, None] + offset * step
     # One loop for both axes: it compiles once.
     frequency, count = jnp.concatenate([fx, fy])[:, None], fx.shape[0]
-    open_part = jnp.where(jnp.arange(frequency.shape[0]) < count, opened[0], opened[1])[:, None]
+    of_rows = (jnp.arange(frequency.shape[0]) >= count).astype(int)[:, None]
+    opened, bar_width, bar_place = (
+        jnp.asarray(part)[of_rows] for part in (slits.opened, slits.bar_width, slits.bar_place)
+    )
 
     def averaged(wavelengths_nm: Float[Array, " k"]) -> Float[Array, "orders n"]:
         lag = frequency * (wavelengths_nm * 1e-6 / model.pitch_mm)
-        return slit_coefficients(lag, open_part, highest) @ triangle
+        whole = barred_overlap(lag, opened, bar_width, bar_place)[None]
+        return jnp.concatenate([whole, slit_coefficients(lag, opened, highest)[1:]]) @ triangle
 
     table = jnp.moveaxis(jax.lax.map(averaged, fine), 0, -1)
     return table[:, :count], table[:, count:]

@@ -18,9 +18,9 @@ from udccal.models.diffraction import (
     LocalFrame,
     blur_variance,
     lattice_frequencies,
-    open_fractions,
     relative_lag,
     sensor_transfer,
+    slits_along,
     slits_of,
     through_sensor,
 )
@@ -53,7 +53,7 @@ def interference_transfer(
         disc_px: diameter of a round source on the sensor; 0 for a point.
     """
     fx, fy = lattice_frequencies(frame, lattice)
-    columns, rows = slits_of(model, open_fractions(model, frame), fx, fy, HIGHEST_ORDER)
+    columns, rows = slits_of(model, slits_along(model, frame), fx, fy, HIGHEST_ORDER)
     strength = strengths(model, footprint_place(model, frame))
 
     def add(

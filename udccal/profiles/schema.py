@@ -1,4 +1,4 @@
-"""``profile.json``, format version 6, which docs/profile.md describes."""
+"""``profile.json``, format version 7, which docs/profile.md describes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import Sha256, StoredCamera
 
 FORMAT: Final = "udccal-profile"
-VERSION: Final = 6
+VERSION: Final = 7
 # Arrays of at most this many values are stored in profile.json, where a person can read and compare them.
 INLINE_VALUES = 512
 
@@ -248,7 +248,7 @@ class StoredProfile(_Strict):
     """The whole of ``profile.json``."""
 
     format: Literal["udccal-profile"]
-    version: Literal[6]
+    version: Literal[7]
     rig: RigDescription
     lineage: Lineage
     provenance: Provenance

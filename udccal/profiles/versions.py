@@ -7,7 +7,7 @@ previous version to the new one. Each function is kept for good, with a stored p
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from udccal.errors import ProfileError
@@ -109,19 +109,27 @@ def _third_section(term: str, section: Any) -> Any:
 
 def _third_to_fourth(found: JsonObject) -> JsonObject:
     """Say that the psf's further blur is the same all over the field and in all colours, as it was before."""
+    new = (("blur_growth", (2,)), ("blur_colour", (3,)))
+    return {**_with_zeros(found, "diffraction.blur_px", new), "version": 4}
+
+
+def _with_zeros(found: JsonObject, after: str, new: Sequence[tuple[str, tuple[int, ...]]]) -> JsonObject:
+    """The psf with new parameters of diffraction (names, shapes) after another one; all are without unit, and 0."""
     terms = found.get("terms")
     psf = terms.get("psf") if isinstance(terms, dict) else None
-    if isinstance(psf, dict) and isinstance(psf.get("parameters"), list):
-        even: list[JsonObject] = [
-            {"kind": "numbers", "name": f"diffraction.{name}", "dtype": "float64", "shape": [size]}
-            | {"value": [0.0] * size, "unit": "1", "sigma": None}
-            for name, size in (("blur_growth", 2), ("blur_colour", 3))
-        ]
-        names = [one.get("name") if isinstance(one, dict) else None for one in psf["parameters"]]
-        at = names.index("diffraction.blur_px") + 1 if "diffraction.blur_px" in names else len(names)
-        parameters = [*psf["parameters"][:at], *even, *psf["parameters"][at:]]
-        terms = {**found["terms"], "psf": {**psf, "parameters": parameters}}
-    return {**found, "version": 4, "terms": terms}
+    if not isinstance(psf, dict) or not isinstance(psf.get("parameters"), list):
+        return found
+    zeros: list[JsonObject] = [
+        {"kind": "numbers", "name": f"diffraction.{name}", "dtype": "float64", "shape": list(shape)}
+        | {"value": [0.0] * shape[0], "unit": "1", "sigma": None}
+        if shape
+        else {"kind": "number", "name": f"diffraction.{name}", "value": 0.0, "unit": "1", "sigma": None}
+        for name, shape in new
+    ]
+    names = [one.get("name") if isinstance(one, dict) else None for one in psf["parameters"]]
+    at = names.index(after) + 1 if after in names else len(names)
+    parameters = [*psf["parameters"][:at], *zeros, *psf["parameters"][at:]]
+    return {**found, "terms": {**found["terms"], "psf": {**psf, "parameters": parameters}}}
 
 
 def _fourth_to_fifth(found: JsonObject) -> JsonObject:
@@ -149,6 +157,12 @@ def _sixth_section(section: Any) -> Any:
     return {**section, "fit": {**fit, "captures": {**fit["captures"], "steps": None}}}
 
 
+def _sixth_to_seventh(found: JsonObject) -> JsonObject:
+    """Say that rows are as deep as columns, and that no bar crosses openings, as it was before."""
+    new = (("depth_ratio", ()), ("bar_width", (2,)), ("bar_place", (2,)))
+    return {**_with_zeros(found, "diffraction.depth_mm", new), "version": 7}
+
+
 # By the version that a function starts from; it returns the next version.
 MIGRATIONS: Mapping[int, Migration] = {
     1: _first_to_second,
@@ -156,6 +170,7 @@ MIGRATIONS: Mapping[int, Migration] = {
     3: _third_to_fourth,
     4: _fourth_to_fifth,
     5: _fifth_to_sixth,
+    6: _sixth_to_seventh,
 }
 
 

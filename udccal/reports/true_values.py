@@ -93,7 +93,8 @@ def _psf(truth: RigTruth) -> tuple[TrueValue, ...]:
     panel = truth.panel
     openings = {"row_open": panel.row_open, "column_open": panel.column_open}
     lengths = {"pitch_mm": panel.pitch_mm, "depth_mm": panel.depth_mm}
-    return _of("psf", openings | lengths | {"pupil_diameter_mm": truth.optics.pupil_diameter_mm})
+    # The simulator's rows are as deep as its columns.
+    return _of("psf", openings | lengths | {"depth_ratio": 0.0, "pupil_diameter_mm": truth.optics.pupil_diameter_mm})
 
 
 def _backscatter(truth: RigTruth) -> tuple[TrueValue, ...]:

@@ -39,6 +39,7 @@ _NUMBERS = {
     "blur_growth_tangential": 7,
     "blur_red": 8,
     "blur_blue": 9,
+    "depth_ratio": 10,
 }
 POINTS_PX = np.array([[350.0, 260.0], [700.0, 480.0]])
 WINDOW = (17, 9)

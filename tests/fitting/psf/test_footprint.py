@@ -13,6 +13,7 @@ from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction
+from udccal.fitting.psf.kernel import HEAD
 from udccal.fitting.psf.start import some_shots, start_model, start_prior
 from udccal.numerics import in_float64
 
@@ -38,7 +39,7 @@ def test_a_descent_that_leaves_the_footprint_for_another_period_begins_there_aga
     fit = fit_diffraction(shots.pick(every_other), scene.geometry, start, prior, rules)
     assert fit.converged
     z = (fit.theta - true) / np.sqrt(np.diag(fit.noise_cov))
-    assert np.abs(z[:13]).max() < 4.5
+    assert np.abs(z[:HEAD]).max() < 4.5
 
 
 def _started_off(factor: float, seed: int) -> tuple[DiffractionFit, Float[np.ndarray, " p"]]:
@@ -61,7 +62,7 @@ def test_a_footprint_that_starts_too_wide_does_not_end_beside_the_minimum(wider:
     fit, z = _started_off(wider, seed)
     assert fit.converged
     assert fit.model_error == 0.0
-    assert np.abs(z[:13]).max() < 4.5
+    assert np.abs(z[:HEAD]).max() < 4.5
 
 
 @pytest.mark.medium

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import softmax
@@ -19,7 +21,9 @@ from udccal.rig import RigDescription
 
 _HALF = (8, 6)
 # Forward and backward, of each parameter before the spectra.
-_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
+_LENS = [1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3]
+_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, *_LENS, 1e-3, *4 * [1e-5], 1e-4, 1e-4, 1e-4])
+_BARS = slice(11, 15)
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +42,18 @@ def shots(scene: Scene, prior: Prior) -> Shots:
     return shots_of(scene, pictures(scene, prior.mean, rng), rng)
 
 
-@pytest.mark.parametrize("interference", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize(
+    ("interference", "barred"), [pytest.param(True, False, marks=pytest.mark.slow), (False, False), (False, True)]
+)
 @pytest.mark.medium
 def test_slopes_of_the_kernel_are_those_of_differences(
-    scene: Scene, prior: Prior, shots: Shots, interference: bool
+    scene: Scene, prior: Prior, shots: Shots, interference: bool, barred: bool
 ) -> None:
-    found, wanted = slopes_both_ways(scene, prior, shots, interference)
+    found, wanted = slopes_both_ways(scene, prior, shots, interference, barred)
+    assert (np.abs(found[_BARS]).max(axis=(1, 2, 3)) > 0).all() == barred
+    if not barred:
+        assert not found[_BARS].any()
+        found, wanted = (np.delete(one, _BARS, axis=0) for one in (found, wanted))
     for own, other in zip(found, wanted, strict=True):
         assert np.abs(own - other).max() <= 0.01 * np.abs(other).max()
     swapped = np.abs(found[1] - wanted[2]).max()
@@ -51,9 +61,12 @@ def test_slopes_of_the_kernel_are_those_of_differences(
 
 
 @in_float64
-def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> tuple[np.ndarray, np.ndarray]:
+def slopes_both_ways(
+    scene: Scene, prior: Prior, shots: Shots, interference: bool, barred: bool
+) -> tuple[np.ndarray, np.ndarray]:
     problem = problem_of(scene, prior, shots, interference)
-    one, theta, evaluator = problem.samples.at(0), prior.mean, problem.evaluator
+    one, theta, evaluator = problem.samples.at(0), prior.mean.copy(), replace(problem.evaluator, barred=barred)
+    theta[_BARS] = np.array([0.03, 0.05, 0.1, -0.08]) * barred
     made, chain = (np.asarray(p) for p in evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps))
     by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
     found = np.einsum("yxfc,fcp->pyxc", by_factor, chain)

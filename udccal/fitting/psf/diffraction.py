@@ -17,8 +17,20 @@ from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRul
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
+from udccal.fitting.psf.bars import Approach, find_bar
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
-from udccal.fitting.psf.kernel import FOOTPRINT, PUPIL, Evaluator, Light, Own, Samples, Theta, fit_lattice, gather
+from udccal.fitting.psf.kernel import (
+    BAR_WIDTH,
+    FOOTPRINT,
+    PUPIL,
+    Evaluator,
+    Light,
+    Own,
+    Samples,
+    Theta,
+    fit_lattice,
+    gather,
+)
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
 from udccal.fitting.psf.start import choose_samples, stands_for
 from udccal.models.diffraction import Diffraction
@@ -39,6 +51,7 @@ class DiffractionFit:
         shots: the data, at the places that the samples are about.
         model_error: as a fraction of the peak, see ``data.left_out``; 0 where the residuals are noise.
         iterations: sum over all descents.
+        bar: comparison by BIC of openings without an opaque bar to openings with one.
         phase: comparison by BIC of a kernel with the wire's phase to one averaged over it; None where no wire was
             seen. The fits are the phase's strength in the kernel (1 where it agrees with the wire, 0 where the kernel
             does not show it) and its sigma.
@@ -50,12 +63,19 @@ class DiffractionFit:
     model_error: float
     outliers: tuple[Outliers, ...]
     iterations: int
+    bar: Choice[Approach] | None = None
     phase: Choice[tuple[float, float]] | None = None
 
     @property
     def theta(self) -> Float[np.ndarray, " p"]:
         """The shared parameters, in the order of ``start.pack``."""
         return self.solution.place.theta
+
+    @property
+    def bar_axis(self) -> int | None:
+        """0 or 1 where a bar crosses the openings of columns or rows; None where there is none."""
+        axes = np.flatnonzero(self.problem.prior.mean[BAR_WIDTH])
+        return int(axes[0]) if axes.size else None
 
     @property
     def converged(self) -> bool:
@@ -134,8 +154,12 @@ def fit_diffraction(
     chosen, lattice = choose_samples(shots, rules), fit_lattice(rules.close(shots.half))
     evaluator = Evaluator(np.asarray(start.wavelengths_nm), lattice, bool(start.visibility))
     problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
-    fits, index = [], problem.samples.index
-    for near in _approach(problem, rules):
+    first = replace(problem, samples=problem.samples.weighed(rules.first_model_error))
+    plain = Approach(first, _from_mean(first, rules))
+    bar = find_bar(plain, _solver(1e-3 * problem.used, rules.iterations), rules)
+    found, fits, index = bar.best.fit, [], problem.samples.index
+    problem = replace(problem, evaluator=found.problem.evaluator, prior=found.problem.prior)
+    for near in (found.end, *_again(problem, found.end, rules)):
         # To the minimum with the samples about the places of LEDs found there.
         own, places = near.place.own.copy(), shots.centre_px.copy()
         places[index[index >= 0]] += own[index >= 0][:, :2]
@@ -143,42 +167,45 @@ def fit_diffraction(
         moved = replace(shots, centre_px=places)
         about = replace(problem, samples=gather(moved, geometry, chosen))
         fits.append(_refine(about, moved, near.place.theta, own, rules, near.iterations))
-    fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits))
+    fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits), bar=bar)
     if not evaluator.interference:
         return fit
     phase = phase_evidence(fit)
     if phase.best is not phase.tried[0]:
-        alone = Evaluator(evaluator.wavelengths_nm, lattice, False)
+        alone = replace(problem.evaluator, interference=False)
         # Those of the fit hold corrections of interference.
-        averaged = DiffractionProblem(gather(fit.shots, geometry, chosen), alone, prior)
+        averaged = DiffractionProblem(gather(fit.shots, geometry, chosen), alone, problem.prior)
         fit = _refine(averaged, fit.shots, fit.theta, fit.solution.place.own, rules, 0)
-    return replace(fit, phase=phase)
+    return replace(fit, bar=bar, phase=phase)
 
 
-def _approach(problem: DiffractionProblem, rules: PsfRules) -> tuple[Solution[Place, Blocks], ...]:
-    """Go from the prior's mean until a step gains a thousandth of the cost; weights are by the data.
-
-    A start that is off may end beside the lowest minimum. The footprint's place on the rows is periodic in the data,
-    and takes the part of a pupil that is too wide; a model error as large as the residuals there lets the place fit. A
-    descent that leaves the prior for this therefore begins again, with the footprint's place held, which leaves the
-    residuals to the pupil, and without a model error. Both ends are returned: their minima tell which is the lower.
-    """
+def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
+    """Go from the prior's mean until a step gains a thousandth of the cost."""
     prior = problem.prior
 
-    def from_mean(problem: DiffractionProblem) -> Solution[Place, Blocks]:
-        def start(one: Samples) -> Own:
-            return start_own(one, kernel_of(problem.evaluator, prior.mean, one))
+    def start(one: Samples) -> Own:
+        return start_own(one, kernel_of(problem.evaluator, prior.mean, one))
 
-        own = np.stack(in_two_threads(start, problem.samples.each()))
-        return minimise(problem, problem.at(prior.mean, own), _solver(1e-3 * problem.used, rules.iterations))
+    own = np.stack(in_two_threads(start, problem.samples.each()))
+    return minimise(problem, problem.at(prior.mean, own), _solver(1e-3 * problem.used, rules.iterations))
 
-    first = from_mean(replace(problem, samples=problem.samples.weighed(rules.first_model_error)))
+
+def _again(
+    problem: DiffractionProblem, first: Solution[Place, Blocks], rules: PsfRules
+) -> tuple[Solution[Place, Blocks], ...]:
+    """Begin again where a first descent has left the prior: it may have ended beside the lowest minimum.
+
+    The footprint's place on the rows is periodic in the data, and takes the part of a pupil that is too wide; a model
+    error as large as the residuals there lets the place fit. The second descent has the footprint's place held, which
+    leaves the residuals to the pupil, and no model error. The minima tell which of the two is the lower.
+    """
+    prior = problem.prior
     far = np.abs(first.place.theta - prior.mean) > _FAR_SIGMA * prior.sigma
     if not far[PUPIL] and not far[FOOTPRINT].any():
-        return (first,)
+        return ()
     held = np.zeros(prior.mean.size, dtype=bool)
     held[FOOTPRINT] = True
-    return first, from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held))
+    return (_from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held), rules),)
 
 
 def _unlikely(fit: DiffractionFit) -> float:
@@ -199,7 +226,7 @@ def _refine(
     whole, enough, damping = None, 1.0, 1e6
     problem = problem.about(theta, own)
     place = problem.at(theta, own)
-    for _ in range(15):
+    for _ in range(30):
         # Weights at the model's light, with the model error of the residuals, and without outliers.
         samples, light, background = problem.samples, place.light, place.own[..., 5:]
         seen, level = samples.known > 0, place.level

@@ -33,7 +33,7 @@ from udccal.fitting.psf.held_out import (
     with_support,
 )
 from udccal.fitting.psf.image import Magnitude
-from udccal.fitting.psf.kernel import BLUR, PITCH
+from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, BLUR, PITCH
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.start import as_numpy, pitch_tolerance, some_shots, start_model, start_prior
@@ -48,7 +48,9 @@ from udccal.rig import RigDescription
 # The first parameters, and which of them are lengths on the panel, which are measured in pitches.
 _DIFFRACTION: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm")
 _BLUR: Final = ("blur_px", "blur_growth_radial", "blur_growth_tangential", "blur_red", "blur_blue")
-_NUMBERS: Final = (*_DIFFRACTION, *_BLUR)
+_NUMBERS: Final = (*_DIFFRACTION, *_BLUR, "depth_ratio")
+# Of a bar through openings of (columns, rows), where there is one.
+BARS: Final = ("column_bar_width", "row_bar_width", "column_bar_place", "row_bar_place")
 # Diagnostics that say what sigma would be if the model had no deviation; of these numbers.
 NOISE_SIGMA: Final = "noise_sigma_"
 # Units of diagnostics that have one.
@@ -56,7 +58,7 @@ _UNITS: Final = dict.fromkeys(("support_rows", "support_columns"), "px") | {
     f"{NOISE_SIGMA}{name}": "mm" for name in ("depth_mm", "pupil_diameter_mm")
 }
 Cov = Float[np.ndarray, "p p"]
-_LENGTHS: Final = np.isin(_NUMBERS, ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
+_LENGTHS: Final = np.isin((*_NUMBERS, *BARS), ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
 
 
 @in_float64
@@ -194,9 +196,13 @@ def _report(
         cov=cov_of_numbers,
         chi2_dof=fit.chi2_dof if diffracts else float(np.mean((found.residual**2 / found.total)[found.known])),
         samples=problem.used if diffracts else int(found.known.sum()),
-        candidates=(*(fit.phase.candidates if fit.phase else ()), *selection.candidates, *along),
+        candidates=(
+            *(one for choice in (fit.bar, fit.phase) if choice for one in choice.candidates),
+            *selection.candidates,
+            *along,
+        ),
         diagnostics=tuple(Diagnostic(name, float(value), _UNITS.get(name, "1")) for name, value in figures.items()),
-        notes=_notes(data, diffracts, pattern_p, off, open_ended),
+        notes=_notes(data, fit if diffracts else None, pattern_p, off, open_ended),
         outliers=fit.outliers,
         residuals=residual_sample(places, z[used]) if diffracts else None,
         posterior=_posterior(fit, cov, error, term, rig),
@@ -216,18 +222,25 @@ def _estimates(
     fit: DiffractionFit, whole: Cov, l2: float, l2_sigma: float, tolerance: float
 ) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
     """Return the numbers of diffraction, and the error ``l2`` of kernels; ``tolerance`` is the pitch's."""
-    count, prior = len(_NUMBERS), fit.problem.prior
-    values, known, sigma, unit = *(v[:count].copy() for v in (fit.theta, prior.mean, prior.sigma)), np.ones(count)
+    prior, found = fit.problem.prior, _numbers_found(fit)
+    names = [(*_NUMBERS, *BARS)[number] for number in found]
+    values, known, sigma, unit = *(v[found] for v in (fit.theta, prior.mean, prior.sigma)), np.ones(len(found))
     # The fit's own parameter is the logarithm of the blur.
     values[BLUR], known[BLUR] = np.exp([values[BLUR], known[BLUR]])
     unit[BLUR], sigma[BLUR] = values[BLUR], sigma[BLUR] * known[BLUR]
     # The fit holds the pitch: its tolerance scales all lengths.
     sigma[PITCH] = known[PITCH] * tolerance
-    by_pitch = np.where(_LENGTHS, values, 0.0) * tolerance
-    cov = whole[:count, :count] * np.outer(unit, unit) + np.outer(by_pitch, by_pitch)
+    by_pitch = np.where(_LENGTHS[found], values, 0.0) * tolerance
+    cov = whole[np.ix_(found, found)] * np.outer(unit, unit) + np.outer(by_pitch, by_pitch)
     # The error of kernels is that of held-out positions, which the numbers do not depend on.
-    cov, names = block_diag(cov, l2_sigma**2), (*_NUMBERS, "kernel_relative_l2")
-    return estimates("psf", names, np.append(values, l2), cov, priors_of(_NUMBERS, known, sigma)), cov
+    cov, priors = block_diag(cov, l2_sigma**2), priors_of(tuple(names), known, sigma)
+    return estimates("psf", (*names, "kernel_relative_l2"), np.append(values, l2), cov, priors), cov
+
+
+def _numbers_found(fit: DiffractionFit) -> list[int]:
+    """Return the indices of the numbers that the fit has determined: those of a bar only where there is one."""
+    bar = () if fit.bar_axis is None else (BAR_WIDTH.start + fit.bar_axis, BAR_PLACE.start + fit.bar_axis)
+    return [*range(len(_NUMBERS)), *bar]
 
 
 def _posterior(
@@ -271,15 +284,21 @@ def _said_to_be_off(stated: KernelError, magnitude: Magnitude) -> str:
     return f"The kernel is off by {whole:.2g} % {where} by {faint:.2g} %; sigmas include that."
 
 
-def _notes(data: PsfData, diffracts: bool, pattern_p: float, off: str, support: tuple[str, ...]) -> tuple[str, ...]:
+def _notes(
+    data: PsfData, fit: DiffractionFit | None, pattern_p: float, off: str, support: tuple[str, ...]
+) -> tuple[str, ...]:
     image = "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is known."
     notes = [image, "chi2_dof is of that image at positions held out, and allows for their model error."]
-    if diffracts:
-        refuted = f"{', '.join(_NUMBERS)} are numbers of a model that they refute. {off}".rstrip()
+    if fit is not None:
+        named = ((*_NUMBERS, *BARS)[number] for number in _numbers_found(fit))
+        refuted = f"{', '.join(named)} are numbers of a model that they refute. {off}".rstrip()
         pattern = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {refuted}"
         off = pattern if pattern_p <= SIGNIFICANT else ""
         notes = ["cov leaves out spectra and field coefficients of the residual."]
         notes += ["chi2_dof is of the fit of diffraction and allows for the model error of its residuals."]
+        if fit.bar_axis is not None:
+            of, wide = ("columns", "rows")[fit.bar_axis], fit.theta[BAR_WIDTH][fit.bar_axis]
+            notes += [f"A bar {wide:.3f} of a period wide crosses the openings of {of}, such as a wire of the panel."]
     notes += [off] if off else []
     if data.doubted:
         notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")

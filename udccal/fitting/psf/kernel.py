@@ -24,14 +24,15 @@ from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
+    Slits,
     average_transfer,
     blur_variance,
     lattice_frequencies,
     local_frame,
-    open_fractions,
     pupil_anchors,
     pupil_overlaps,
     sensor_transfer,
+    slits_along,
     slits_of,
 )
 from udccal.models.geometry import Geometry
@@ -51,10 +52,11 @@ WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 # Nodes of a fit's lattice to a pixel.
 PER_PX: Final = 4
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
-# in mm, the logarithm of the blur in px, and the footprint's place on columns and rows with its stand-off, in pitches.
-HEAD: Final = 13
-PITCH, PUPIL, BLUR, GROWTH, FOOTPRINT = 0, 4, 5, slice(6, 8), slice(10, 13)
-BLUR_RED, BLUR_BLUE = 8, 9
+# in mm, the logarithm of the blur in px, bars of (columns, rows), and the footprint's place on columns and rows with
+# its stand-off, in pitches.
+HEAD: Final = 18
+PITCH, PUPIL, BLUR, GROWTH, BLUR_RED, BLUR_BLUE, DEPTH_RATIO = 0, 4, 5, slice(6, 8), 8, 9, 10
+OPENINGS, BAR_WIDTH, BAR_PLACE, FOOTPRINT = slice(1, 3), slice(11, 13), slice(13, 15), slice(15, 18)
 OWN: Final = 6
 _PER_SAMPLE = ("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps")
 # Parameters of diffraction; own parameters and light of the shots, of one position or of all.
@@ -68,19 +70,30 @@ Overlaps = Float[Arrayish, "nodes terms rows half"]
 
 @final
 class Evaluator(eqx.Module):
-    """The constants of a fit that every call uses; ``interference`` where the footprint's place on rows is known."""
+    """The constants of a fit that every call uses.
+
+    Attributes:
+        wavelengths_nm: nodes of the spectra.
+        lattice: of kernels.
+        interference: whether the footprint's place on rows is known.
+        barred: whether bars may be in the openings. Without, their parameters have no derivatives, which saves time.
+    """
 
     wavelengths_nm: Float[Arrayish, " nodes"]
     lattice: Lattice = eqx.field(static=True)
     interference: bool = eqx.field(static=True)
+    barred: bool = eqx.field(static=True, default=False)
 
     def model(self, theta: Float[Arrayish, " p"]) -> Diffraction:
         """Return the model of a vector of parameters; see ``start.pack``."""
         theta = jnp.asarray(theta)
         return Diffraction(
             pitch_mm=theta[PITCH],
-            openings=theta[1:3],
+            openings=theta[OPENINGS],
             depth_mm=theta[3],
+            depth_ratio=theta[DEPTH_RATIO],
+            bar_width=theta[BAR_WIDTH],
+            bar_place=theta[BAR_PLACE],
             pupil_diameter_mm=theta[PUPIL],
             blur_px=jnp.exp(theta[BLUR]),
             blur_growth=theta[GROWTH],
@@ -118,9 +131,9 @@ class Evaluator(eqx.Module):
         """Return spline coefficients of the kernel at every wavelength node, and its derivatives by factor and colour.
 
         Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the
-        footprint's place (x, y), and the blur's covariance, with the ``overlaps`` of interference held. The second
-        result has their derivatives by the parameters before the spectra. The average over the footprint's place is one
-        more term of interference, (0, 0), of strength 1.
+        footprint's place (x, y), bars if there may be any, and the blur's covariance, with the ``overlaps`` of
+        interference held. The second result has their derivatives by the parameters before the spectra. The average
+        over the footprint's place is one more term of interference, (0, 0), of strength 1.
         """
         model, lattice = self.model(theta), self.lattice
         spectra, variance = jnp.asarray(model.spectrum), blur_variance(model, frame)
@@ -140,22 +153,23 @@ class Evaluator(eqx.Module):
 
         def at_node(node: tuple[Array, Array, Array, Array]) -> Float[Array, "variants rows half"]:
             columns, rows, own, part = node
+            (column, *column_bar), (row, *row_bar) = ([one[0] for one in (*by[:1], *by[3:])] for by in (columns, rows))
             average, narrower = (jnp.tensordot(part, anchors, 1) for anchors in (pupils, by_pupil))
             overlap = jnp.concatenate([average[None], own])
-            x, by_open_x, by_pitch_x = columns[:, column_of, None, :] * overlap
-            y, by_open_y, by_pitch_y = strength * rows[:, row_of]
+            x, by_open_x, by_pitch_x = columns[:3, column_of, None, :] * overlap
+            y, by_open_y, by_pitch_y = strength * rows[:3, row_of]
 
             def light(down: Array, across: Array) -> Float[Array, "rows half"]:
                 return jnp.sum(down[..., None] * across, axis=0)
 
-            by_pitch, pupil = (
-                light(y, by_pitch_x) + light(by_pitch_y, x),
-                rows[0, 0][:, None] * columns[0, 0] * narrower,
-            )
+            by_pitch, pupil = light(y, by_pitch_x) + light(by_pitch_y, x), row[:, None] * column * narrower
             moved = [light(by[:, None] * rows[0, row_of], x) for by in by_place.T]
-            return jnp.stack([light(y, x), light(y, by_open_x), light(by_open_y, x), by_pitch, pupil, *moved])
+            pairs = [(by, row) for by in column_bar] + [(column, by) for by in row_bar]
+            bars = [down[:, None] * across * average for across, down in pairs]
+            return jnp.stack([light(y, x), light(y, by_open_x), light(by_open_y, x), by_pitch, pupil, *moved, *bars])
 
-        every = jax.lax.map(at_node, (*_slits(model, frame, fx, fy), jnp.asarray(overlaps), pupil_anchors(model)[1].T))
+        slits = self._slits(model, frame, fx, fy)
+        every = jax.lax.map(at_node, (*slits, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
         # As one product of matrices: an einsum over the nodes takes five times as long.
         mixed = (spectra @ every.reshape(len(every), -1)).reshape(len(spectra), *every.shape[1:])
         by_factor = jax.lax.map(lambda one: one * sensor, jnp.swapaxes(mixed[:, 1:], 0, 1))
@@ -165,31 +179,36 @@ class Evaluator(eqx.Module):
 
         def factors(head: Float[Array, " head"]) -> Float[Array, "factors 3"]:
             model = self.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
-            opened, place = open_fractions(model, frame), footprint_place(model, frame)
-            common = jnp.stack([*opened, head[PITCH], head[PUPIL], *place])
+            slits, place = slits_along(model, frame), footprint_place(model, frame)
+            bars = jnp.stack([slits.bar_width, slits.bar_place], axis=1).ravel()[: 4 * self.barred]
+            common = jnp.concatenate([slits.opened, head[jnp.array([PITCH, PUPIL])], place, bars])
             return jnp.concatenate([jnp.tile(common[:, None], (1, 3)), blur_variance(model, frame).T])
 
         return spline_coefficients(lattice, seen), jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
+
+    def _slits(
+        self, model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
+    ) -> tuple[Float[Array, "nodes ways orders half"], Float[Array, "nodes ways orders rows"]]:
+        """Return slits of both axes, and derivatives by open part, by pitch with the others held, and by bars."""
+
+        def tables(slits: Slits, pitch_mm: Float[Array, ""]) -> tuple[Array, Array]:
+            return slits_of(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), slits, fx, fy, HIGHEST_ORDER)
+
+        at = slits_along(model, frame), jnp.asarray(model.pitch_mm)
+
+        def changed(way: Float[Array, "4"]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+            # Columns depend on their own openings and bars alone, as do rows.
+            slits = Slits(*(jnp.full(2, part) for part in (way[0], way[2], way[3])))
+            return jax.jvp(tables, at, (slits, way[1]))
+
+        value, derivatives = jax.vmap(changed, out_axes=(None, 0))(jnp.eye(4)[: 4 if self.barred else 2])
+        return jax.tree.map(lambda own, by: jnp.moveaxis(jnp.concatenate([own[None], by]), -1, 0), value, derivatives)
 
 
 def fit_lattice(half: tuple[int, int]) -> Lattice:
     """Return a fit's lattice, a quarter wider than the window, for sources off the middle."""
     rows, columns = (1.25 * (2 * h + 9) for h in half)
     return lattice_for(rows, columns, PER_PX, PER_PX)
-
-
-def _slits(
-    model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
-) -> tuple[Float[Array, "nodes 3 orders half"], Float[Array, "nodes 3 orders rows"]]:
-    """Return slits of both axes, and derivatives by a ray's open part and by the pitch, with the other held."""
-
-    def tables(opened: Float[Array, "2"], pitch_mm: Float[Array, ""]) -> tuple[Array, Array]:
-        return slits_of(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), opened, fx, fy, HIGHEST_ORDER)
-
-    at = (open_fractions(model, frame), jnp.asarray(model.pitch_mm))
-    ways = (jnp.array([[1.0, 1.0], [0.0, 0.0]]), jnp.array([0.0, 1.0]))
-    value, derivatives = jax.vmap(lambda *way: jax.jvp(tables, at, way), out_axes=(None, 0))(*ways)
-    return jax.tree.map(lambda own, by: jnp.moveaxis(jnp.concatenate([own[None], by]), -1, 0), value, derivatives)
 
 
 @final
@@ -228,7 +247,7 @@ class Samples(eqx.Module):
     disc_px: Float[Arrayish, "*positions"]
     index: Int[np.ndarray, "*positions shots"]
 
-    def at(self, which: int | slice) -> Samples:
+    def at(self, which: int | slice | Int[np.ndarray, " some"]) -> Samples:
         """Return the samples of one position, or of several."""
         return jax.tree.map(lambda part: part[which], self)
 

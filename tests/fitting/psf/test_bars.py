@@ -1,0 +1,58 @@
+"""An opaque bar through the panel's openings: found where there is one, with its width and place, and only there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.scenes.psf import pictures, shots_of, small_scene
+from udccal.fitting.psf.data import PsfRules
+from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction
+from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, DEPTH_RATIO
+from udccal.fitting.psf.start import start_model, start_prior
+from udccal.numerics import in_float64
+
+_RATIO = 0.25
+
+
+@in_float64
+def fitted(axis: int, width: float, place: float) -> tuple[DiffractionFit, np.ndarray]:
+    """A fit to pictures by a panel with such a bar, and with rows deeper than columns; its true parameters."""
+    scene = small_scene(positions=(3, 2), shifts=2, half=(24, 10))
+    prior = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire))
+    rng, true = np.random.default_rng(5), prior.mean.copy()
+    true[DEPTH_RATIO], true[BAR_WIDTH][axis], true[BAR_PLACE][axis] = _RATIO, width, place
+    shots = shots_of(scene, pictures(scene, true, rng), rng)
+    rules = replace(PsfRules(), close_px=scene.half)
+    return fit_diffraction(
+        shots, scene.geometry, start_model(scene.rig, scene.geometry, scene.wire), prior, rules
+    ), true
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("axis", "width", "place"), [(1, 0.03, 0.08), (1, 0.02, 0.005), (0, 0.025, 0.3)])
+def test_a_bar_is_found_with_its_width_and_place(axis: int, width: float, place: float) -> None:
+    fit, true = fitted(axis, width, place)
+    assert fit.converged
+    assert fit.bar_axis == axis
+    assert fit.bar is not None
+    assert ("columns", "rows")[axis] in fit.bar.best.name
+    sigma = np.sqrt(np.diag(fit.cov()))
+    for part in (BAR_WIDTH, BAR_PLACE):
+        # Kernels do not tell on which side of the middle it is.
+        found, wanted = abs(fit.theta[part][axis]), true[part][axis]
+        assert abs(found - wanted) < 4.5 * sigma[part][axis]
+    assert sigma[BAR_WIDTH][axis] < 0.1 * width
+    assert abs(fit.theta[DEPTH_RATIO] - _RATIO) < 4.5 * sigma[DEPTH_RATIO]
+
+
+@pytest.mark.medium
+def test_openings_without_a_bar_have_none() -> None:
+    fit, _ = fitted(0, 0.0, 0.0)
+    assert fit.converged
+    assert fit.bar_axis is None
+    assert fit.bar is not None
+    # None was looked for: openings without one fit.
+    assert [one.name for one in fit.bar.tried] == ["openings without a bar (BIC)"]
