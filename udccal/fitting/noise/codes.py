@@ -18,7 +18,7 @@ from scipy.special import beta, xlogy
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
-from udccal.fitting.noise.data import Codes, NoiseRules
+from udccal.fitting.noise.data import Codes, NoiseRules, dark_window
 
 # The shape with the kurtosis of a normal distribution.
 NORMAL_SHAPE: Final = 0.1349
@@ -72,16 +72,6 @@ def converter_step(frame: Codes) -> int:
     """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
     codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
     return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
-
-
-def dark_window(first: Codes, q_DN: int) -> tuple[int, int]:
-    """Return the median of a dark frame, and how far usual codes reach about it, both in steps of the converter."""
-    low, less, middle, more, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 16.0, 50.0, 84.0, 98.0])
-    # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
-    half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
-    usual = int(np.ceil(3.9 * (more - less) / q_DN)) + 4
-    # Unless hot pixels made it wide.
-    return round(middle / q_DN), usual if half > max(2 * usual, 80) else half
 
 
 def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:

@@ -9,43 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.misfit import chi2_tail, excess_sigma
+from udccal.fitting.engine.misfit import chi2_tail, excess_sigma, excess_variance
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.codes import LOW, DarkFit, Five, excess_kurtosis, fit_dark, pair_probability, row_gain
 from udccal.fitting.noise.moments import NoiseMoments
-from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
+from udccal.fitting.noise.patterns import Cov, DarkTerms, dsnu
 
 PerPair = Float[np.ndarray, " _"]
 # Of black and dark current.
 Two = Float[np.ndarray, "2"]
-Cov = Float[np.ndarray, "2 2"]
-
-
-@final
-@dataclass(frozen=True)
-class DarkTerms:
-    """Dark quantities; ``levels_cov`` is that of (black, dark current); ``white``: no pixel's mean shows rounding.
-
-    ``foreign``: no distribution of the family describes the read noise; its variance is that of the codes. ``skewed``:
-    none describes the mean code; black and dark current are those of the mean of all pixels. Black differs from
-    exposure to exposure by ``unsteady_DN``, where that is more than noise.
-    """
-
-    K_DN_per_e: float
-    curvature: float
-    black_DN: float
-    dark_DN_per_s: Quantity
-    levels_cov: Cov
-    unsteady_DN: float
-    read_DN2: Quantity
-    shape: Quantity
-    row_DN2: Quantity
-    dsnu_DN2: Quantity
-    white: bool
-    foreign: bool
-    skewed: bool
-    fit: DarkFit
-    offsets: Pattern
 
 
 def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature: float = 0.0) -> DarkTerms:
@@ -101,11 +73,11 @@ def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five) -> _Codes:
     def fitted(row_DN: float, start: Five, normal: bool = False) -> DarkFit:
         return fit_dark(data.darks, K_DN_per_e, row_DN, rules, start, normal)
 
-    row, row_DN = row_noise(data, np.ones(len(data.darks)))
+    row, row_DN = _row_noise(data, np.ones(len(data.darks)))
     fit = fitted(row_DN, start)
     for _ in range(10):
         gains = np.array([row_gain(pair, fit.values, K_DN_per_e, row_DN) for pair in data.darks])
-        before, (row, row_DN) = row_DN, row_noise(data, gains)
+        before, (row, row_DN) = row_DN, _row_noise(data, gains)
         if abs(row_DN**2 - before**2) <= 0.1 * row.variance**0.5:
             break
         # Each depends on the other in the opposite sense: half-way between is near to where both agree.
@@ -113,7 +85,7 @@ def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five) -> _Codes:
         fit = fitted(row_DN, fit.values)
     if float(fit.values[2]) + row_DN**2 < (0.15 * data.q_DN) ** 2:
         # Temporal noise below 0.15 of a code cannot be distinguished from the pattern of rounding.
-        row, unresolved = row_noise(data, np.zeros(len(data.darks)))[0], data.rounding_DN2
+        row, unresolved = _row_noise(data, np.zeros(len(data.darks)))[0], data.rounding_DN2
     fit = _with_drawn_rows(fit, data, row_DN)
     if row_DN > 0 and np.abs(gains - 1).max() > rules.white:
         # Rounding hides part of the row noise, and what is wrong with it is taken for read noise.
@@ -286,3 +258,30 @@ def _temporal(data: NoiseMoments, most_hits: float, of_all: bool) -> tuple[PerPa
         fourth = (np.sum(pair.counts * pair.differences_DN**4) + tails * of.outlier_powers[1]) / of.pixels
         variances.append(max(fourth / 4 - values[-1] ** 2, values[-1] ** 2) / of.pixels)
     return np.array(values), np.maximum(variances, 1e-30)
+
+
+def _row_noise(data: NoiseMoments, row_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
+    """Variance by rows, and its root in the pairs alone, which is the one that widened their histograms.
+
+    Rounding and cut-off codes change the variance of a pair by the square of its ``row_gains``. How much depends on the
+    distribution of the read noise, which coarse codes hardly show: half of the change is in the sigma.
+    """
+    seen, pairs = data.dark_moments, len(data.darks)
+    if data.dark_seen is not None:
+        nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
+        seen, row_gains = (*seen, data.dark_seen), np.append(row_gains, row_gains[nearest])
+    every = [(of.rows_DN2, of.sampling_DN2, (of.frames - 1) * max(of.height - 1, 1)) for of in seen]
+    # Pairs whose mean code follows black to less than a fifth do not determine row noise.
+    used = [i for i, gain in enumerate(row_gains) if gain >= 0.2 and every[i][0] > 0]
+
+    def asked(used: list[int]) -> Quantity:
+        if not used:
+            # Row noise that rounding hides completely may be as large as rounding itself.
+            return Quantity.asked("row noise", 0.0, data.rounding_DN2**2, data.dark_samples, 0.0)
+        rows, sampling, dof = np.array(every)[used].T
+        squares = row_gains[used] ** 2, (0.5 * (1 + row_gains[used])) ** 2
+        (value, variance, gain), (other, _, _) = (excess_variance(rows / of, sampling / of, dof) for of in squares)
+        return Quantity.asked("row noise", value, variance + (value - other) ** 2, data.dark_samples, gain)
+
+    row = asked(used)
+    return row, float(np.sqrt(asked([i for i in used if i < pairs]).value)) if row.there else 0.0

@@ -216,3 +216,13 @@ def read_noise(session: Session) -> NoiseData:
     dark, flat = averages.get("dark_stack"), averages.get("flat_stack")
     stack = SpatialStack(flat.exposure_s, dark, flat) if dark is not None and flat is not None else None
     return NoiseData(tuple(levels), stack, bayer=True, top_code=int(session.rig.saturation_DN))
+
+
+def dark_window(first: Codes, q_DN: int) -> tuple[int, int]:
+    """Return the median of a dark frame, and how far usual codes reach about it, both in steps of the converter."""
+    low, less, middle, more, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 16.0, 50.0, 84.0, 98.0])
+    # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
+    half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
+    usual = int(np.ceil(3.9 * (more - less) / q_DN)) + 4
+    # Unless hot pixels made it wide.
+    return round(middle / q_DN), usual if half > max(2 * usual, 80) else half

@@ -13,9 +13,9 @@ from scipy.special import ndtri
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.noise.codes import excess_kurtosis, standard_cdf
-from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.frame_moments import Moments, Shared, stacked
 from udccal.fitting.noise.moments import NoiseMoments, steadied
+from udccal.fitting.noise.patterns import DarkTerms
 from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]

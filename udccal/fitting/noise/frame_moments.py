@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from udccal.fitting.noise.codes import dark_window
-from udccal.fitting.noise.data import Averaged, Codes, NoiseRules
+from udccal.fitting.noise.data import Averaged, Codes, NoiseRules, dark_window
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
 Picture = Float32[np.ndarray, "rows columns"]

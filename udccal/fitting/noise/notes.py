@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.flats import Curve
 from udccal.fitting.noise.frame_moments import MIDDLE_ROWS, Picture, Shared
 from udccal.fitting.noise.moments import NoiseMoments
-from udccal.fitting.noise.patterns import Pattern, rough_median
+from udccal.fitting.noise.patterns import DarkTerms, Pattern, rough_median
 from udccal.result import Outliers
 
 

@@ -1,4 +1,4 @@
-"""Variances between rows and between pixels: row noise, DSNU of dark averages, and PRNU behind a panel.
+"""Variances between pixels: DSNU of dark averages, with the other dark quantities, and PRNU behind a panel.
 
 The response of pixels is white; light is not. Light that passed a panel is modulated. The modulation's harmonics and
 their products fall slowly below the floor of the pixels' own response. One coefficient of the spectrum, or a block of
@@ -18,42 +18,16 @@ from jaxtyping import Bool, Float, Float32
 from scipy.fft import dctn
 from scipy.special import ndtri
 
-from udccal.fitting.engine.misfit import excess_variance
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
+from udccal.fitting.noise.codes import DarkFit
 from udccal.fitting.noise.frame_moments import product_sum
-from udccal.fitting.noise.moments import NoiseMoments
 
 Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
 Mask = Bool[np.ndarray, "rows columns"]
 Grid = Float[np.ndarray, "down across"]
-
-
-def row_noise(data: NoiseMoments, row_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
-    """Variance by rows, and its root in the pairs alone, which is the one that widened their histograms.
-
-    Rounding and cut-off codes change the variance of a pair by the square of its ``row_gains``. How much depends on the
-    distribution of the read noise, which coarse codes hardly show: half of the change is in the sigma.
-    """
-    seen, pairs = data.dark_moments, len(data.darks)
-    if data.dark_seen is not None:
-        nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
-        seen, row_gains = (*seen, data.dark_seen), np.append(row_gains, row_gains[nearest])
-    every = [(of.rows_DN2, of.sampling_DN2, (of.frames - 1) * max(of.height - 1, 1)) for of in seen]
-    # Pairs whose mean code follows black to less than a fifth do not determine row noise.
-    used = [i for i, gain in enumerate(row_gains) if gain >= 0.2 and every[i][0] > 0]
-
-    def asked(used: list[int]) -> Quantity:
-        if not used:
-            # Row noise that rounding hides completely may be as large as rounding itself.
-            return Quantity.asked("row noise", 0.0, data.rounding_DN2**2, data.dark_samples, 0.0)
-        rows, sampling, dof = np.array(every)[used].T
-        squares = row_gains[used] ** 2, (0.5 * (1 + row_gains[used])) ** 2
-        (value, variance, gain), (other, _, _) = (excess_variance(rows / of, sampling / of, dof) for of in squares)
-        return Quantity.asked("row noise", value, variance + (value - other) ** 2, data.dark_samples, gain)
-
-    row = asked(used)
-    return row, float(np.sqrt(asked([i for i in used if i < pairs]).value)) if row.there else 0.0
+# Of black and dark current.
+Cov = Float[np.ndarray, "2 2"]
 
 
 @final
@@ -102,6 +76,33 @@ def dsnu(dark_DN: Picture, temporal: Quantity, row_DN2: float, defect_sigma: flo
     drawn = float(np.sum(2 * np.maximum(parts**2 - own**2, 0.0) / counts))
     variance, sigma = total - temporal.value - row_DN2, float(np.sqrt(drawn + temporal.variance))
     return Pattern(variance, sigma, samples, int(bad.sum()), _first_places(bad), mean)
+
+
+@final
+@dataclass(frozen=True)
+class DarkTerms:
+    """Dark quantities; ``levels_cov`` is that of (black, dark current); ``white``: no pixel's mean shows rounding.
+
+    ``foreign``: no distribution of the family describes the read noise; its variance is that of the codes. ``skewed``:
+    none describes the mean code; black and dark current are those of the mean of all pixels. Black differs from
+    exposure to exposure by ``unsteady_DN``, where that is more than noise.
+    """
+
+    K_DN_per_e: float
+    curvature: float
+    black_DN: float
+    dark_DN_per_s: Quantity
+    levels_cov: Cov
+    unsteady_DN: float
+    read_DN2: Quantity
+    shape: Quantity
+    row_DN2: Quantity
+    dsnu_DN2: Quantity
+    white: bool
+    foreign: bool
+    skewed: bool
+    fit: DarkFit
+    offsets: Pattern
 
 
 def _first_places(bad: Mask) -> tuple[tuple[int, int], ...]:
