@@ -106,7 +106,7 @@ def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> No
     assert grating.worst_l2 < 0.03
     assert grating.result.estimate("row_open").value == pytest.approx(0.3917, abs=0.004)
     assert all(estimate.sigma > 0 for estimate in grating.result.estimates)
-    assert grating.result.cov.shape == (11, 11)
+    assert grating.result.cov.shape == (12, 12)
     sigmas = [estimate.sigma for estimate in grating.result.estimates]
     np.testing.assert_allclose(np.sqrt(np.diag(grating.result.cov)), sigmas)
     # The rig file alone tells the pitch.

@@ -58,6 +58,7 @@ class PsfRules:
         depth_ratio: prior sigma of the logarithm of the rows' depth over the columns'.
         bar_width, bar_sigma: of an opaque bar through the openings: its width at first, and prior sigmas of width and
             place, in periods.
+        least_bar: width in periods below which there is no bar.
         barred_from: squared residuals by ``first_model_error`` from which a bar is looked for.
         bar_places: distances of the bar's middle from the opening's that are tried first, as parts of the opening.
         bar_positions, bar_steps: field positions of these first tries, and their steps.
@@ -102,6 +103,7 @@ class PsfRules:
     depth_ratio: float = 0.2
     bar_width: float = 0.02
     bar_sigma: tuple[float, float] = (0.03, 0.1)
+    least_bar: float = 0.003
     barred_from: float = 1.5
     bar_places: tuple[float, ...] = (0.05, 0.15, 0.3, 0.42)
     bar_positions: int = 3

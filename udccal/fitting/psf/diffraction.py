@@ -9,20 +9,19 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.special import ndtr
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse, square_root
-from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRules, minimise
+from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
-from udccal.fitting.psf.bars import Approach, find_bar
+from udccal.fitting.psf.approach import Approach, approach, solver_rules
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.kernel import (
     BAR_WIDTH,
     FOOTPRINT,
-    PUPIL,
     Evaluator,
     Light,
     Own,
@@ -31,15 +30,11 @@ from udccal.fitting.psf.kernel import (
     fit_lattice,
     gather,
 )
-from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
+from udccal.fitting.psf.problem import DiffractionProblem, Place
 from udccal.fitting.psf.start import choose_samples, stands_for
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
-from udccal.numerics import in_two_threads
 from udccal.result import Outliers
-
-# Of the prior: a chance that drawn rigs do not have.
-_FAR_SIGMA = 4.0
 
 
 @final
@@ -154,12 +149,21 @@ def fit_diffraction(
     chosen, lattice = choose_samples(shots, rules), fit_lattice(rules.close(shots.half))
     evaluator = Evaluator(np.asarray(start.wavelengths_nm), lattice, bool(start.visibility))
     problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
-    first = replace(problem, samples=problem.samples.weighed(rules.first_model_error))
-    plain = Approach(first, _from_mean(first, rules))
-    bar = find_bar(plain, _solver(1e-3 * problem.used, rules.iterations), rules)
-    found, fits, index = bar.best.fit, [], problem.samples.index
-    problem = replace(problem, evaluator=found.problem.evaluator, prior=found.problem.prior)
-    for near in (found.end, *_again(problem, found.end, rules)):
+    bar = approach(problem, rules)
+    for attempt in (bar.best, bar.tried[0]):
+        fit = replace(_finish(attempt.fit, shots, geometry, chosen, rules), bar=Choice(attempt, bar.tried))
+        # A bar that vanishes at the minimum was none.
+        if fit.bar_axis is None or abs(fit.theta[BAR_WIDTH][fit.bar_axis]) > rules.least_bar:
+            break
+    return fit
+
+
+def _finish(
+    begun: Approach, shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots rows columns"], rules: PsfRules
+) -> DiffractionFit:
+    """Go on to the lowest of the minima next to where first descents ended, with the wire's phase or without it."""
+    fits, problem, index = [], begun.problem, begun.problem.samples.index
+    for near in begun.ends:
         # To the minimum with the samples about the places of LEDs found there.
         own, places = near.place.own.copy(), shots.centre_px.copy()
         places[index[index >= 0]] += own[index >= 0][:, :2]
@@ -167,45 +171,16 @@ def fit_diffraction(
         moved = replace(shots, centre_px=places)
         about = replace(problem, samples=gather(moved, geometry, chosen))
         fits.append(_refine(about, moved, near.place.theta, own, rules, near.iterations))
-    fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits), bar=bar)
-    if not evaluator.interference:
+    fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits))
+    if not problem.evaluator.interference:
         return fit
     phase = phase_evidence(fit)
     if phase.best is not phase.tried[0]:
         alone = replace(problem.evaluator, interference=False)
-        # Those of the fit hold corrections of interference.
+        # Samples of the fit hold corrections of interference.
         averaged = DiffractionProblem(gather(fit.shots, geometry, chosen), alone, problem.prior)
         fit = _refine(averaged, fit.shots, fit.theta, fit.solution.place.own, rules, 0)
-    return replace(fit, bar=bar, phase=phase)
-
-
-def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
-    """Go from the prior's mean until a step gains a thousandth of the cost."""
-    prior = problem.prior
-
-    def start(one: Samples) -> Own:
-        return start_own(one, kernel_of(problem.evaluator, prior.mean, one))
-
-    own = np.stack(in_two_threads(start, problem.samples.each()))
-    return minimise(problem, problem.at(prior.mean, own), _solver(1e-3 * problem.used, rules.iterations))
-
-
-def _again(
-    problem: DiffractionProblem, first: Solution[Place, Blocks], rules: PsfRules
-) -> tuple[Solution[Place, Blocks], ...]:
-    """Begin again where a first descent has left the prior: it may have ended beside the lowest minimum.
-
-    The footprint's place on the rows is periodic in the data, and takes the part of a pupil that is too wide; a model
-    error as large as the residuals there lets the place fit. The second descent has the footprint's place held, which
-    leaves the residuals to the pupil, and no model error. The minima tell which of the two is the lower.
-    """
-    prior = problem.prior
-    far = np.abs(first.place.theta - prior.mean) > _FAR_SIGMA * prior.sigma
-    if not far[PUPIL] and not far[FOOTPRINT].any():
-        return ()
-    held = np.zeros(prior.mean.size, dtype=bool)
-    held[FOOTPRINT] = True
-    return (_from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held), rules),)
+    return replace(fit, phase=phase)
 
 
 def _unlikely(fit: DiffractionFit) -> float:
@@ -236,7 +211,7 @@ def _refine(
         problem = replace(problem, samples=samples.weighed(model_error, light, background))
         kept, found = without_outliers(problem.samples, problem.errors(place), rules)
         problem = replace(problem, samples=kept)
-        solution = minimise(problem, place, _solver(enough, rules.iterations - iterations, damping))
+        solution = minimise(problem, place, solver_rules(enough, rules.iterations - iterations, damping))
         iterations += solution.iterations
         change = solution.place.theta - place.theta
         moved = float(np.sqrt(change @ solution.equations.marginal()[0] @ change))
@@ -259,11 +234,6 @@ def _refine(
             place = problem.at(place.theta, place.own)
     # Weights that go on to change the parameters give no minimum.
     return replace(fit, solution=replace(fit.solution, converged=False))
-
-
-def _solver(enough: float, iterations: int, most_damping: float = 1e6) -> SolverRules:
-    # Derivatives are sums over a lattice, whose errors predict a small gain without end.
-    return SolverRules(enough, stalled_gain=0.05, iterations=iterations, first_damping=1e-2, most_damping=most_damping)
 
 
 def without_outliers(samples: Samples, z: Light, rules: PsfRules) -> tuple[Samples, tuple[Outliers, ...]]:

@@ -185,6 +185,7 @@ def _report(
     if diffracts:
         l2_sigma = float(np.hypot(by_parameters, spread))
         numbers, cov_of_numbers = _estimates(fit, cov, l2, l2_sigma, pitch_tolerance(rig))
+    compared = [choice for choice in (fit.bar, fit.phase) if choice and len(choice.tried) > 1]
     along = (candidate for choice in support for candidate in choice.candidates)
     term, open_ended = with_support(term, support, rig)
     places = fit.shots.centre_px[np.broadcast_to(problem.samples.index[..., None], used.shape)[used]]
@@ -197,7 +198,7 @@ def _report(
         chi2_dof=fit.chi2_dof if diffracts else float(np.mean((found.residual**2 / found.total)[found.known])),
         samples=problem.used if diffracts else int(found.known.sum()),
         candidates=(
-            *(one for choice in (fit.bar, fit.phase) if choice for one in choice.candidates),
+            *(one for choice in compared for one in choice.candidates),
             *selection.candidates,
             *along,
         ),
@@ -213,7 +214,7 @@ def _figures(fit: DiffractionFit, diffracts: bool, support: Support) -> dict[str
     figures = {}
     if fit.phase:
         figures["wire_phase_strength"], figures["wire_phase_strength_sigma"] = fit.phase.best.fit
-    figures["support_rows"], figures["support_columns"] = (one.best.fit for one in support)
+    figures["support_rows"], figures["support_columns"] = (float(one.best.fit) for one in support)
     by_noise = list(zip(_DIFFRACTION, np.sqrt(np.diag(fit.noise_cov)), strict=False)) if diffracts else []
     return figures | {NOISE_SIGMA + name: sigma for name, sigma in by_noise[1:]}
 
