@@ -10,6 +10,7 @@ import pytest
 from tests.scenes.psf import pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction
+from udccal.fitting.psf.fit import _estimates
 from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, DEPTH_RATIO
 from udccal.fitting.psf.start import start_model, start_prior
 from udccal.numerics import in_float64
@@ -45,6 +46,11 @@ def test_a_bar_is_found_with_its_width_and_place(axis: int, width: float, place:
         found, wanted = abs(fit.theta[part][axis]), true[part][axis]
         assert abs(found - wanted) < 4.5 * sigma[part][axis]
     assert sigma[BAR_WIDTH][axis] < 0.1 * width
+    numbers = {one.name: one for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
+    of = ("column", "row")[axis]
+    assert numbers[f"{of}_bar_width"].value == fit.theta[BAR_WIDTH][axis]
+    assert numbers[f"{of}_bar_place"].value == abs(fit.theta[BAR_PLACE][axis])
+    assert not {f"{('row', 'column')[axis]}_bar_{name}" for name in ("width", "place")} & set(numbers)
     assert abs(fit.theta[DEPTH_RATIO] - _RATIO) < 4.5 * sigma[DEPTH_RATIO]
 
 
@@ -54,5 +60,6 @@ def test_openings_without_a_bar_have_none() -> None:
     assert fit.converged
     assert fit.bar_axis is None
     assert fit.bar is not None
+    assert not any("bar" in one.name for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0])
     # None was looked for: openings without one fit.
     assert [one.name for one in fit.bar.tried] == ["openings without a bar (BIC)"]

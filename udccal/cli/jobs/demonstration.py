@@ -92,14 +92,18 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
         blur = pool.submit(lambda: world.light.blur)
         backscatterer = pool.submit(lambda: world.light.backscatterer)
         capture_watched(output, bench, Wanted(out / "session", _EARLY[:1]))
-        blur.result()  # Boards are seen through it: two threads would compute it twice.
+        with output.stage("blur of the simulated panel"):
+            blur.result()  # Boards are seen through it: two threads would compute it twice.
         capture_watched(output, bench, Wanted(out / "session", _EARLY[1:]))
-        backscatterer.result()
+        with output.stage("backscatter of the simulated panel"):
+            backscatterer.result()
         foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
         pool.submit(lambda: _prepare_kernels(rig, foundation.result()))
         capture_watched(output, bench, Wanted(out / "session", [term for term in ORDER if term not in _EARLY]))
         session = Session.open(out / "session")
-        calibration = run_fits(output, session, QUICK, foundation.result())
+        with output.stage("fits of noise, geometry and wire"):
+            first = foundation.result()
+        calibration = run_fits(output, session, QUICK, first)
         show_status(output, calibration)
         gathered = pool.submit(gather, session, calibration, panel_picture, world.light)
         store_profile(output, calibration, out / "profile")

@@ -57,7 +57,7 @@ def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
     attempts = [plain.attempt("openings without a bar (BIC)")]
     if plain.cost > rules.barred_from * problem.used:
         axis, found = _with_bar(plain, rules)
-        if any(abs(end.place.theta[BAR_WIDTH][axis]) > rules.least_bar for end in found.ends):
+        if any(end.place.theta[BAR_WIDTH][axis] > rules.least_bar for end in found.ends):
             attempts.append(found.attempt(f"a bar through openings of {_AXES[axis]} (BIC)"))
     return choose(attempts)
 

@@ -153,7 +153,7 @@ def fit_diffraction(
     for attempt in (bar.best, bar.tried[0]):
         fit = replace(_finish(attempt.fit, shots, geometry, chosen, rules), bar=Choice(attempt, bar.tried))
         # A bar that vanishes at the minimum was none.
-        if fit.bar_axis is None or abs(fit.theta[BAR_WIDTH][fit.bar_axis]) > rules.least_bar:
+        if fit.bar_axis is None or fit.theta[BAR_WIDTH][fit.bar_axis] > rules.least_bar:
             break
     return fit
 

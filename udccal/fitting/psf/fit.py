@@ -197,11 +197,7 @@ def _report(
         cov=cov_of_numbers,
         chi2_dof=fit.chi2_dof if diffracts else float(np.mean((found.residual**2 / found.total)[found.known])),
         samples=problem.used if diffracts else int(found.known.sum()),
-        candidates=(
-            *(one for choice in compared for one in choice.candidates),
-            *selection.candidates,
-            *along,
-        ),
+        candidates=(*(one for choice in compared for one in choice.candidates), *selection.candidates, *along),
         diagnostics=tuple(Diagnostic(name, float(value), _UNITS.get(name, "1")) for name, value in figures.items()),
         notes=_notes(data, fit if diffracts else None, pattern_p, off, open_ended),
         outliers=fit.outliers,
@@ -229,6 +225,8 @@ def _estimates(
     # The fit's own parameter is the logarithm of the blur.
     values[BLUR], known[BLUR] = np.exp([values[BLUR], known[BLUR]])
     unit[BLUR], sigma[BLUR] = values[BLUR], sigma[BLUR] * known[BLUR]
+    # Kernels do not tell on which side of the opening's middle a bar is.
+    values[len(_NUMBERS) :] = np.abs(values[len(_NUMBERS) :])
     # The fit holds the pitch: its tolerance scales all lengths.
     sigma[PITCH] = known[PITCH] * tolerance
     by_pitch = np.where(_LENGTHS[found], values, 0.0) * tolerance
