@@ -17,7 +17,7 @@ from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import PsfRules
-from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, FOOTPRINT, OPENINGS, PUPIL, Own, Samples
+from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, FOOTPRINT, OPENINGS, PUPIL, Own, Samples, Theta
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
 from udccal.numerics import in_two_threads
 
@@ -31,20 +31,16 @@ _FAR_SIGMA = 4.0
 @final
 @dataclass(frozen=True)
 class Approach:
-    """A problem with weights by the data, and where its first descents ended."""
+    """A problem with weights by the data, and where a first descent ended."""
 
     problem: DiffractionProblem
-    ends: tuple[Solution[Place, Blocks], ...]
-
-    @property
-    def cost(self) -> float:
-        """The lowest."""
-        return min(self.problem.equations_at(end.place).cost for end in self.ends)
+    end: Solution[Place, Blocks]
 
     def attempt(self, name: str) -> Attempt[Approach]:
         """As an order that BIC compares to others."""
         unknowns = self.problem.unknowns + _OF_BAR * self.problem.evaluator.barred
-        return Attempt(name, unknowns, bic(self.cost, float(unknowns), self.problem.used), self)
+        criterion = bic(self.end.equations.cost, float(unknowns), self.problem.used)
+        return Attempt(name, unknowns, criterion, self)
 
 
 def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
@@ -53,31 +49,29 @@ def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
     A bar is looked for where openings without one do not fit; BIC compares the two.
     """
     problem = replace(problem, samples=problem.samples.weighed(rules.first_model_error))
-    plain = _with_second(problem, _from_mean(problem, rules), rules)
+    plain = Approach(problem, _from_mean(problem, rules))
     attempts = [plain.attempt("openings without a bar (BIC)")]
-    if plain.cost > rules.barred_from * problem.used:
+    if plain.end.equations.cost > rules.barred_from * problem.used:
         axis, found = _with_bar(plain, rules)
-        if any(end.place.theta[BAR_WIDTH][axis] > rules.least_bar for end in found.ends):
+        if found.end.place.theta[BAR_WIDTH][axis] > rules.least_bar:
             attempts.append(found.attempt(f"a bar through openings of {_AXES[axis]} (BIC)"))
     return choose(attempts)
 
 
-def _with_second(problem: DiffractionProblem, first: Solution[Place, Blocks], rules: PsfRules) -> Approach:
-    """Begin again where a first descent has left the prior: it may have ended beside the lowest minimum.
+def second_approach(problem: DiffractionProblem, theta: Theta, rules: PsfRules) -> tuple[Solution[Place, Blocks], ...]:
+    """Begin again where a minimum has left the prior: it may be beside the lowest one.
 
     The footprint's place on the rows is periodic in the data, and takes the part of a pupil that is too wide; a model
     error as large as the residuals there lets the place fit. The second descent has the footprint's place held, which
     leaves the residuals to the pupil, and no model error. The minima tell which of the two is the lower.
     """
     prior = problem.prior
-    far = np.abs(first.place.theta - prior.mean) > _FAR_SIGMA * prior.sigma
+    far = np.abs(theta - prior.mean) > _FAR_SIGMA * prior.sigma
     if not far[PUPIL] and not far[FOOTPRINT].any():
-        return Approach(problem, (first,))
+        return ()
     held = np.zeros(prior.mean.size, dtype=bool)
     held[FOOTPRINT] = True
-    return Approach(
-        problem, (first, _from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held), rules))
-    )
+    return (_from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held), rules),)
 
 
 def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
@@ -94,7 +88,7 @@ def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, 
 def _with_bar(plain: Approach, rules: PsfRules) -> tuple[int, Approach]:
     """Begin at every place on both axes for a few steps with some positions, and go on from the best with all."""
     problem = replace(plain.problem, evaluator=replace(plain.problem.evaluator, barred=True))
-    own, tried = plain.ends[0].place.own, []
+    own, tried = plain.end.place.own, []
     # Positions spread over the field; the first steps need no more.
     spread = np.unique(np.linspace(0, len(own) - 1, rules.bar_positions).round().astype(int))
     few, enough = replace(problem, samples=problem.samples.at(spread)), 1e-3 * problem.used
@@ -107,7 +101,7 @@ def _with_bar(plain: Approach, rules: PsfRules) -> tuple[int, Approach]:
     _, axis, prior, theta = min(tried, key=lambda one: one[0])
     problem = replace(problem, prior=prior)
     solution = minimise(problem, problem.at(theta, own), solver_rules(enough, rules.iterations))
-    return axis, _with_second(problem, solution, rules)
+    return axis, Approach(problem, solution)
 
 
 def barred_prior(prior: Prior, axis: int, place: float, rules: PsfRules) -> Prior:

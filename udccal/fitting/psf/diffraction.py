@@ -17,7 +17,7 @@ from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
-from udccal.fitting.psf.approach import Approach, approach, solver_rules
+from udccal.fitting.psf.approach import Approach, approach, second_approach, solver_rules
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.kernel import (
     BAR_WIDTH,
@@ -162,15 +162,19 @@ def _finish(
     begun: Approach, shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots rows columns"], rules: PsfRules
 ) -> DiffractionFit:
     """Go on to the lowest of the minima next to where first descents ended, with the wire's phase or without it."""
-    fits, problem, index = [], begun.problem, begun.problem.samples.index
-    for near in begun.ends:
-        # To the minimum with the samples about the places of LEDs found there.
+    problem, index = begun.problem, begun.problem.samples.index
+
+    def refined(near: Solution[Place, Blocks]) -> DiffractionFit:
+        # With the samples about the places of LEDs found there.
         own, places = near.place.own.copy(), shots.centre_px.copy()
         places[index[index >= 0]] += own[index >= 0][:, :2]
         own[..., :2] = 0.0
         moved = replace(shots, centre_px=places)
         about = replace(problem, samples=gather(moved, geometry, chosen))
-        fits.append(_refine(about, moved, near.place.theta, own, rules, near.iterations))
+        return _refine(about, moved, near.place.theta, own, rules, near.iterations)
+
+    first = refined(begun.end)
+    fits = [first, *(refined(near) for near in second_approach(problem, first.theta, rules))]
     fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits))
     if not problem.evaluator.interference:
         return fit

@@ -206,7 +206,7 @@ def _joint(found: Descent, every: Pixels, search: Search) -> _Joint:
     problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, kept.prior(start, rules))
     # On the pixels of the search: by then, columns that are strong enough leave a single place.
     others = likely_columns(found, found.problem.pixels, start, rules.rival * found.variance) if panel else []
-    last, spread = best_of_columns(Descent(problem, minimise(problem, x, SOLVER)), others)
+    last, spread = best_of_columns(Descent(problem, minimise(problem, x, SOLVER)), others, found.problem.pixels)
     solution = last.solution
     # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
     x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)

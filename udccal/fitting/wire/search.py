@@ -218,10 +218,11 @@ def likely_columns(descent: Descent, pixels: Pixels, start: WireStart, margin: f
     return [shifted[k] for k in np.argsort(chi2, kind="stable") if chi2[k] <= chi2.min() + margin]
 
 
-def best_of_columns(here: Descent, starts: list[Wire]) -> tuple[Descent, Float[np.ndarray, "n n"]]:
+def best_of_columns(here: Descent, starts: list[Wire], few: Pixels) -> tuple[Descent, Float[np.ndarray, "n n"]]:
     """The lowest of the minima that are reached from the columns' places of other wires, and the parameters' spread.
 
-    The spread is the second moment of all minima about the lowest one, each with the weight of its likelihood.
+    The spread is the second moment of all minima about the lowest one, each with the weight of its likelihood. Descents
+    that come back to it on ``few`` pixels are not repeated on all.
     """
     problem, first = here.problem, here.problem.parameters.linear
     offset, opening = (first + SHAPE_NAMES.index(name) for name in ("offset_x_periods", "column_open"))
@@ -229,7 +230,10 @@ def best_of_columns(here: Descent, starts: list[Wire]) -> tuple[Descent, Float[n
     for start in starts:
         x = here.solution.place.copy()
         x[offset], x[opening] = float(start.offset_periods[0]), float(start.column_open)
-        tried.append(minimise(problem, x, SOLVER))
+        x = minimise(replace(problem, pixels=few), x, SOLVER).place
+        moved = x[offset] - here.solution.place[offset]
+        if abs(moved - np.round(moved)) > _APART:
+            tried.append(minimise(problem, x, SOLVER))
     best, *others = sorted(tried, key=lambda one: one.equations.cost)
     away, weights = [np.zeros_like(best.place)], [1.0]
     for one in others:
