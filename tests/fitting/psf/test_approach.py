@@ -22,14 +22,13 @@ _RATIO = 0.25
 def fitted(axis: int, width: float, place: float) -> tuple[DiffractionFit, np.ndarray]:
     """A fit to pictures by a panel with such a bar, and with rows deeper than columns; its true parameters."""
     scene = small_scene(positions=(3, 2), shifts=2, half=(24, 10))
-    prior = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire))
+    start = start_model(scene.rig, scene.geometry, scene.wire)
+    prior = start_prior(scene.rig, start)
     rng, true = np.random.default_rng(5), prior.mean.copy()
     true[DEPTH_RATIO], true[BAR_WIDTH][axis], true[BAR_PLACE][axis] = _RATIO, width, place
     shots = shots_of(scene, pictures(scene, true, rng), rng)
     rules = replace(PsfRules(), close_px=scene.half)
-    return fit_diffraction(
-        shots, scene.geometry, start_model(scene.rig, scene.geometry, scene.wire), prior, rules
-    ), true
+    return fit_diffraction(shots, scene.geometry, start, prior, rules), true
 
 
 @pytest.mark.medium

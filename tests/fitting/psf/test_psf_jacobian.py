@@ -12,7 +12,17 @@ from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.kernel import HEAD, PITCH, PUPIL, WAVELENGTHS_NM, Evaluator, fit_lattice, gather
+from udccal.fitting.psf.kernel import (
+    BAR_PLACE,
+    BAR_WIDTH,
+    HEAD,
+    PITCH,
+    PUPIL,
+    WAVELENGTHS_NM,
+    Evaluator,
+    fit_lattice,
+    gather,
+)
 from udccal.fitting.psf.problem import DiffractionProblem, stepped
 from udccal.fitting.psf.start import start_model, start_prior, wavelengths_nm
 from udccal.numerics import in_float64
@@ -23,7 +33,7 @@ _HALF = (8, 6)
 # Forward and backward, of each parameter before the spectra.
 _LENS = [1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3]
 _STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, *_LENS, 1e-3, *4 * [1e-5], 1e-4, 1e-4, 1e-4])
-_BARS = slice(11, 15)
+_BARS = slice(BAR_WIDTH.start, BAR_PLACE.stop)
 
 
 @pytest.fixture(scope="module")

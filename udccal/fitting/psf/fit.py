@@ -51,6 +51,7 @@ _BLUR: Final = ("blur_px", "blur_growth_radial", "blur_growth_tangential", "blur
 _NUMBERS: Final = (*_DIFFRACTION, *_BLUR, "depth_ratio")
 # Of a bar through openings of (columns, rows), where there is one.
 BARS: Final = ("column_bar_width", "row_bar_width", "column_bar_place", "row_bar_place")
+_NAMES: Final = (*_NUMBERS, *BARS)
 # Diagnostics that say what sigma would be if the model had no deviation; of these numbers.
 NOISE_SIGMA: Final = "noise_sigma_"
 # Units of diagnostics that have one.
@@ -58,7 +59,7 @@ _UNITS: Final = dict.fromkeys(("support_rows", "support_columns"), "px") | {
     f"{NOISE_SIGMA}{name}": "mm" for name in ("depth_mm", "pupil_diameter_mm")
 }
 Cov = Float[np.ndarray, "p p"]
-_LENGTHS: Final = np.isin((*_NUMBERS, *BARS), ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
+_LENGTHS: Final = np.isin(_NAMES, ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
 
 
 @in_float64
@@ -220,7 +221,7 @@ def _estimates(
 ) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
     """Return the numbers of diffraction, and the error ``l2`` of kernels; ``tolerance`` is the pitch's."""
     prior, found = fit.problem.prior, _numbers_found(fit)
-    names = [(*_NUMBERS, *BARS)[number] for number in found]
+    names = [_NAMES[number] for number in found]
     values, known, sigma, unit = *(v[found] for v in (fit.theta, prior.mean, prior.sigma)), np.ones(len(found))
     # The fit's own parameter is the logarithm of the blur.
     values[BLUR], known[BLUR] = np.exp([values[BLUR], known[BLUR]])
@@ -289,7 +290,7 @@ def _notes(
     image = "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is known."
     notes = [image, "chi2_dof is of that image at positions held out, and allows for their model error."]
     if fit is not None:
-        named = ((*_NUMBERS, *BARS)[number] for number in _numbers_found(fit))
+        named = (_NAMES[number] for number in _numbers_found(fit))
         refuted = f"{', '.join(named)} are numbers of a model that they refute. {off}".rstrip()
         pattern = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {refuted}"
         off = pattern if pattern_p <= SIGNIFICANT else ""
