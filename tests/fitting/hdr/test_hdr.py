@@ -330,9 +330,9 @@ def test_a_wrong_time_is_told_of_the_frame_that_gives_most_of_the_light() -> Non
 
 
 def test_a_psf_of_doubted_brackets_says_so() -> None:
-    told = psf_notes(PsfData(None, 3, doubted=("psf/1: Check K.",)), True, 1.0, "", ())
+    told = psf_notes(PsfData(None, 3, doubted=("psf/1: Check K.",)), None, 1.0, "", ())
     assert "1 of 3 brackets are in doubt. psf/1: Check K." in told
-    assert not any("doubt" in note for note in psf_notes(PsfData(None, 3), True, 1.0, "", ()))
+    assert not any("doubt" in note for note in psf_notes(PsfData(None, 3), None, 1.0, "", ()))
 
 
 def test_two_frames_that_differ_are_told_where_no_third_decides() -> None:
