@@ -12,14 +12,14 @@ from udccal.fitting.backscatter.parameters import NAMES as BACKSCATTER
 from udccal.fitting.geometry.fit import _NAMES as GEOMETRY
 from udccal.fitting.noise.fit import NAMES as NOISE
 from udccal.fitting.psf.fit import _NUMBERS as PSF
-from udccal.fitting.psf.fit import BARS
+from udccal.fitting.psf.fit import SHAPE
 from udccal.fitting.wire.parameters import SHAPE_NAMES as WIRE
 from udccal.profiles.units import unit_of
 from udccal.quantities import Quantity, quantities, quantity
 from udccal.sessions.schema import TermName
 
 NAMES = {
-    "noise": NOISE, "geometry": GEOMETRY, "wire": WIRE, "psf": (*PSF, *BARS, "kernel_relative_l2"),
+    "noise": NOISE, "geometry": GEOMETRY, "wire": WIRE, "psf": (*PSF, *SHAPE, "kernel_relative_l2"),
     "backscatter": BACKSCATTER, "rig": STATE,
 }  # fmt: skip
 

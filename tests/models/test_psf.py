@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,10 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from udccal.models.diffraction import (
     Diffraction,
-    barred_overlap,
+    Slits,
     disc_autocorrelation,
     local_frame,
+    opening_overlaps,
     slit_coefficients,
+    window_overlap,
 )
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.models.geometry import Geometry
@@ -29,6 +32,8 @@ from udccal.simulation.spectrum import camera_spectrum
 from udccal.simulation.truth import RigTruth, draw_truth
 
 ROWS, COLUMNS = 49, 25
+GREEN_NM = np.array([550.0, 550.0 + 1e-6])
+Pair = tuple[float, float]
 
 
 def as_numpy(function: Callable[..., object]) -> Callable[..., np.ndarray]:
@@ -52,6 +57,7 @@ def true_field(truth: RigTruth) -> PsfField:
         depth_ratio=np.float64(0.0),
         bar_width=np.zeros(2),
         bar_place=np.zeros(2),
+        corner=np.float64(0.0),
         pupil_diameter_mm=np.float64(optics.pupil_diameter_mm),
         blur_px=np.float64(0.0),
         blur_growth=np.zeros(2),
@@ -104,8 +110,55 @@ def test_slits_with_a_bar_against_a_sum(lag: float, width: float, place: float) 
         return (np.abs(away) < opened / 2) & ~(np.abs(away - place) < width / 2)
 
     expected = (open_at(y + lag) & open_at(y)).mean() / (opened - width)
-    found = as_numpy(barred_overlap)(np.array([lag]), opened, width, place)[0]
+    found = as_numpy(overlap_at)((lag, 0.0), (opened, 1.0), (width, 0.0), (place, 0.0), 0.0)
     assert found == pytest.approx(expected, abs=4e-4)
+
+
+def overlap_at(lag: Pair, opened: Pair, width: Pair, place: Pair, corner: float) -> jax.Array:
+    """Of openings at a lag of (columns, rows), of green light alone."""
+    slits = Slits(*(jnp.array(part) for part in (opened, width, place, (corner, corner))))
+    model = true_field(draw_truth(load_rig("lg55-reduced"), seed=1)).diffraction
+    model = replace(model, wavelengths_nm=GREEN_NM, spectrum=np.ones((3, 2)))
+    per_period = model.pitch_mm / (GREEN_NM[0] * 1e-6)
+    columns, rows = opening_overlaps(model, slits, *(jnp.array([part * per_period]) for part in lag), corner > 0)
+    return jnp.sum(columns[:, 0, 0] * rows[:, 0, 0]) / slits.open_part(corner > 0)
+
+
+@pytest.mark.parametrize("lag", [(0.0, 0.0), (0.1, 0.05), (0.2, 0.31), (-0.3, 0.8), (1.4, 0.02), (2.9, 2.95)])
+@pytest.mark.parametrize(("width", "place"), [(0.0, 0.0), (0.05, 0.1), (0.06, 0.16)])
+def test_openings_with_round_corners_against_a_sum(lag: Pair, width: float, place: float) -> None:
+    opened, corner, axis = (0.8, 0.4), 0.15, (np.arange(1000) + 0.5) / 1000
+    across, down = (part / 2 - corner for part in opened)
+
+    def open_at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x, y = ((at + 0.5) % 1 - 0.5 for at in (x, y))
+        inside, bar = (np.abs(x) < opened[0] / 2) & (np.abs(y) < opened[1] / 2), np.abs(y - place) < width / 2
+        away = np.hypot(np.maximum(np.abs(x) - across, 0.0), np.maximum(np.abs(y) - down, 0.0))
+        return inside & ~bar & (away < corner)
+
+    x, y = np.meshgrid(axis, axis)
+    here = open_at(x, y)
+    expected = (open_at(x + lag[0], y + lag[1]) & here).mean() / here.mean()
+    found, square = (as_numpy(overlap_at)(lag, opened, (0.0, width), (0.0, place), at) for at in (corner, 0.0))
+    assert found == pytest.approx(expected, abs=3e-3)
+    assert abs(square - expected) > 4e-3 or max(expected, 1.0 - expected) > 0.999  # that the comparison can fail
+
+
+@pytest.mark.parametrize("spread", [1e-9, 0.02, 0.3])
+def test_an_overlap_of_windows_is_averaged_over_the_spread(spread: float) -> None:
+    apart, shift = np.linspace(-1.3, 2.6, 40), spread * (np.arange(-199, 200) / 200)
+    triangle = (1 - np.abs(shift) / spread) / 200
+
+    def overlap(one: float, other: float, apart: np.ndarray) -> np.ndarray:
+        nearer = np.abs(apart - np.round(apart))
+        return sum(np.clip((one + other) / 2 - away, 0.0, min(one, other)) for away in (nearer, 1 - nearer))
+
+    for one, other in ((0.7, 0.3), (0.9, 0.8), (0.4, 0.0)):
+        expected = overlap(one, other, apart[:, None] + shift) @ triangle
+        found = as_numpy(lambda *parts: window_overlap(*map(jnp.asarray, parts)))(
+            np.full(40, one), np.full(40, other), apart, np.full(40, spread)
+        )
+        np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -130,9 +130,9 @@ def test_what_came_later_is_as_it_was_meant_before(version: int, document: JsonO
     growth, colour = ([0.125, -0.0625], [0.03125, 0.0, -0.015625]) if version >= 4 else (np.zeros(2), np.zeros(3))
     np.testing.assert_array_equal(profile.psf.term.diffraction.blur_growth, growth)
     np.testing.assert_array_equal(profile.psf.term.diffraction.blur_colour, colour)
-    # Rows were as deep as columns, and no bar was in the openings.
-    assert not stored & {"diffraction.depth_ratio", "diffraction.bar_width", "diffraction.bar_place"}
-    for name in ("depth_ratio", "bar_width", "bar_place"):
+    # Rows were as deep as columns, and openings were rectangles without a bar.
+    for name in ("depth_ratio", "bar_width", "bar_place", "corner"):
+        assert f"diffraction.{name}" not in stored
         assert not np.any(getattr(profile.psf.term.diffraction, name))
 
 

@@ -28,6 +28,9 @@ from udccal.models.lattice import Frequencies
 _FINE_NM = 1.0
 # Bars narrower than this are none, in periods.
 _LEAST_BAR = 1e-3
+# A round corner is cut in three steps, at these parts of its radius along either axis: powers of orders that have a
+# ten-thousandth of the light are right to a tenth where the radius is 0.15 of a period.
+_STEPS = (0.0, 0.056, 0.179, 0.335, 0.545, 0.803)
 PUPIL_NODES = 4
 
 
@@ -42,6 +45,7 @@ class Diffraction(eqx.Module):
         bar_width: width of an opaque bar through the openings of the (columns, rows) in periods, for a ray along the
             normal; none below a thousandth. Its depth is theirs.
         bar_place: distance of the bar's middle from the opening's, in periods; kernels do not tell its sign.
+        corner: radius of the openings' round corners, in periods.
         pupil_diameter_mm: diameter of the entrance pupil.
         offset_periods: centre (X, Y) of the footprint of a ray along the normal, in periods from the middle of an
             opening, modulo 1.
@@ -61,6 +65,7 @@ class Diffraction(eqx.Module):
     depth_ratio: Float[Arrayish, ""]
     bar_width: Float[Arrayish, "2"]
     bar_place: Float[Arrayish, "2"]
+    corner: Float[Arrayish, ""]
     pupil_diameter_mm: Float[Arrayish, ""]
     offset_periods: Float[Arrayish, "2"]
     standoff_per_pitch: Float[Arrayish, ""]
@@ -78,11 +83,27 @@ class Slits(eqx.Module):
     Attributes:
         opened: width of the opening in periods, the bar included.
         bar_width, bar_place: width of the bar, and distance of its middle from the opening's, in periods.
+        corner: radius of the corners on (columns, rows) in periods.
     """
 
     opened: Float[Arrayish, "2"]
     bar_width: Float[Arrayish, "2"]
     bar_place: Float[Arrayish, "2"]
+    corner: Float[Arrayish, "2"]
+
+    def levels(
+        self, rounded: bool
+    ) -> tuple[Float[Array, "levels 2"], Float[Array, "levels 2"], Float[Array, "levels 2"]]:
+        """Return open width, and width and place of the bar, at the steps of round corners, the widest first."""
+        opened = self.opened - 2.0 * jnp.array(_STEPS if rounded else _STEPS[:1])[:, None] * self.corner
+        return opened, *_inside(opened, self.bar_width, self.bar_place)
+
+    def open_part(self, rounded: bool) -> Float[Array, ""]:
+        """Return what corners leave of the opening's area."""
+        opened, bar_width, _ = self.levels(rounded)
+        columns, rows = jnp.moveaxis(opened - bar_width, 1, 0)
+        # Where rows are open least, columns are open most.
+        return jnp.sum((columns - jnp.append(columns[1:], 0.0)) * rows[::-1]) / (columns[0] * rows[0])
 
 
 class LocalFrame(eqx.Module):
@@ -127,6 +148,7 @@ def average_transfer(
     lattice: Frequencies,
     spectra: Float[Array, "3 nodes"],
     disc_px: Float[Arrayish, ""] = 0.0,
+    rounded: bool = True,
 ) -> Float[Array, "3 rows half"]:
     """Return transfer functions averaged over the footprint's place: the term g = h = 0, pixel included.
 
@@ -136,19 +158,22 @@ def average_transfer(
         lattice: lattice in panel directions around the source.
         spectra: light of each colour at the model's wavelength nodes.
         disc_px: diameter of a round source on the sensor; 0 for a point.
+        rounded: False leaves round corners out, which saves time.
     """
     fx, fy = lattice_frequencies(frame, lattice)
-    columns, rows = (table[0] for table in slits_of(model, slits_along(model, frame), fx, fy, 0))
+    slits = slits_along(model, frame)
+    columns, rows = opening_overlaps(model, slits, fx, fy, rounded)
+    rows = rows / slits.open_part(rounded)
 
     def add(
         total: Float[Array, "3 rows half"], anchor: tuple[Array, Array]
     ) -> tuple[Float[Array, "3 rows half"], None]:
         pupil, part = anchor
-        return total + jnp.einsum("cj,yj,xj->cyx", spectra * part, rows, columns) * pupil, None
+        return total + jnp.einsum("cj,pyj,pxj->cyx", spectra * part, rows, columns) * pupil, None
 
     # A loop over overlaps computed beforehand: without it the compiler computes them again for every channel.
     anchors = pupil_overlaps(model, frame, lattice), pupil_anchors(model)[1]
-    total, _ = jax.lax.scan(add, jnp.zeros((3, rows.shape[0], columns.shape[0])), anchors)
+    total, _ = jax.lax.scan(add, jnp.zeros((3, rows.shape[1], columns.shape[1])), anchors)
     return through_sensor(total, sensor_transfer(frame, fx, fy, blur_variance(model, frame), disc_px))
 
 
@@ -185,9 +210,15 @@ def slits_along(model: Diffraction, frame: LocalFrame) -> Slits:
     shadow = depth * jnp.abs(frame.direction[:2] / frame.direction[2])
     opened, bar, place = (jnp.asarray(part) for part in (model.openings, model.bar_width, model.bar_place))
     opened, bar = jnp.clip(opened - shadow, 0.02, 1.0), jnp.where(bar > _LEAST_BAR, bar + shadow, 0.0)
-    # Only what is inside the opening counts.
+    return Slits(opened, *_inside(opened, bar, place), jnp.clip(model.corner, 0.0, 0.6 * opened))
+
+
+def _inside(
+    opened: Float[Arrayish, "*levels 2"], bar: Float[Arrayish, "2"], place: Float[Arrayish, "2"]
+) -> tuple[Float[Array, "*levels 2"], Float[Array, "*levels 2"]]:
+    """Return width and place of what is inside the opening of a bar."""
     first, last = (jnp.clip(place + side * bar / 2, -opened / 2, opened / 2) for side in (-1.0, 1.0))
-    return Slits(opened, jnp.minimum(last - first, 0.9 * opened), (first + last) / 2)
+    return jnp.minimum(last - first, 0.9 * opened), (first + last) / 2
 
 
 def relative_lag(
@@ -230,23 +261,62 @@ def slit_coefficients(
     return jnp.stack(made)
 
 
-def barred_overlap(
-    relative_lag: Float[Arrayish, "*n"],
-    opened: Float[Arrayish, "*#n"],
-    bar_width: Float[Arrayish, "*#n"],
-    bar_place: Float[Arrayish, "*#n"],
-) -> Float[Array, "*n"]:
-    """Return the open part of slits with an opaque bar times themselves moved by the lag in pitches; 1 at lag 0."""
+def opening_overlaps(
+    model: Diffraction, slits: Slits, fx: Float[Array, " half"], fy: Float[Array, " rows"], rounded: bool
+) -> tuple[Float[Array, "parts half nodes"], Float[Array, "parts rows nodes"]]:
+    """Return the open part times itself moved, averaged over the light of each wavelength node, by columns and rows.
 
-    def common(one: Float[Arrayish, "*#n"], other: Float[Arrayish, "*#n"], apart: Float[Array, "*n"]) -> Array:
-        # Two widths in periods, in the same period and in the next.
-        nearer = apart - jnp.floor(apart)
-        reach, most = (one + other) / 2.0, jnp.minimum(one, other)
-        return jnp.clip(reach - nearer, 0.0, most) + jnp.clip(reach - 1.0 + nearer, 0.0, most)
+    The sum over parts of one times the other is that of a period. Without round corners there is one part. With them
+    the opening is a pile of slits: those of rows that each step leaves, by the columns that it opens in addition.
 
-    lag = jnp.asarray(relative_lag)
-    crossed = common(opened, bar_width, lag - bar_place) + common(opened, bar_width, lag + bar_place)
-    return (common(opened, opened, lag) - crossed + common(bar_width, bar_width, lag)) / (opened - bar_width)
+    Args:
+        model: the diffraction term.
+        slits: along the source's ray.
+        fx: cycles per unit direction cosine along x, for the columns. fy: along y, for the rows.
+        rounded: whether the openings' corners may be round.
+    """
+    nodes, levels = jnp.asarray(model.wavelengths_nm) * (1e-6 / model.pitch_mm), slits.levels(rounded)
+
+    def pairs(axis: int, frequency: Float[Array, " n"]) -> Float[Array, "levels levels n nodes"]:
+        # A node's light is a triangle as wide as its distance to its neighbours.
+        lag, spread = frequency[:, None] * nodes, jnp.abs(frequency)[:, None] * (nodes[1] - nodes[0])
+        opened, bar, place = (part[:, axis, None, None, None] for part in levels)
+        other, other_bar, other_place = (jnp.swapaxes(part, 0, 1) for part in (opened, bar, place))
+        both = window_overlap(opened, other, lag, spread)
+        both += window_overlap(bar, other_bar, lag + other_place - place, spread)
+        both -= window_overlap(opened, other_bar, lag + other_place, spread)
+        both -= window_overlap(other, bar, lag - place, spread)
+        return both / (slits.opened[axis] - slits.bar_width[axis])
+
+    columns, rows = pairs(0, fx), pairs(1, fy)[::-1, ::-1]
+    for axis in (0, 1):
+        columns = -jnp.diff(columns, axis=axis, append=0.0)
+    return columns.reshape(-1, *columns.shape[2:]), rows.reshape(-1, *rows.shape[2:])
+
+
+def window_overlap(
+    one: Float[Arrayish, "*#n"], other: Float[Arrayish, "*#n"], apart: Float[Array, "*#n"], spread: Float[Array, "*#n"]
+) -> Array:
+    """Return the overlap of two rows of windows of period 1, averaged over a triangle of distances.
+
+    Its second derivative by the distance is a sum of pulses where edges meet.
+
+    Args:
+        one, other: widths of the windows.
+        apart: distance of the rows.
+        spread: half of the triangle's base, at most half a period.
+    """
+
+    def bend(edge: Array) -> Array:
+        # Twice the integral of a pulse in every period, less its mean, and that averaged near the pulse.
+        away = jnp.abs(edge - jnp.round(edge))
+        part = jnp.minimum(away / wide, 1.0)
+        near = wide * (1.0 / 6.0 + part**2 * (0.5 - part / 6.0))
+        return 0.5 * away**2 - jnp.where(away < wide, near, 0.5 * away)
+
+    wide, reach, differ = jnp.clip(spread, 1e-9, 0.5), (one + other) / 2.0, (one - other) / 2.0
+    edges = bend(apart + reach) + bend(apart - reach) - bend(apart + differ) - bend(apart - differ)
+    return one * other - edges
 
 
 def slits_of(
@@ -254,9 +324,9 @@ def slits_of(
 ) -> tuple[Float[Array, "orders half nodes"], Float[Array, "orders rows nodes"]]:
     """Return slit coefficients of columns and of rows, averaged over the light of each wavelength node.
 
-    A node's light is a triangle as wide as its distance to its neighbours, summed in steps of about a nanometre. High
-    orders therefore smear into a continuum, as they do in daylight, without a node for every nanometre. Bars are in
-    order 0 alone: the others move a hundredth of the light, and a bar changes a part of that.
+    A node's light is a triangle as wide as its distance to its neighbours. High orders therefore smear into a
+    continuum, as they do in daylight, without a node for every nanometre. Orders above 0 are summed in steps of about a
+    nanometre and leave bars out: they move a hundredth of the light, and a bar changes a part of that.
 
     Args:
         model: the diffraction term.
@@ -272,18 +342,15 @@ def slits_of(
     fine = nodes[:, None] + offset * step
     # One loop for both axes: it compiles once.
     frequency, count = jnp.concatenate([fx, fy])[:, None], fx.shape[0]
-    of_rows = (jnp.arange(frequency.shape[0]) >= count).astype(int)[:, None]
-    opened, bar_width, bar_place = (
-        jnp.asarray(part)[of_rows] for part in (slits.opened, slits.bar_width, slits.bar_place)
-    )
+    opened = jnp.asarray(slits.opened)[(jnp.arange(frequency.shape[0]) >= count).astype(int)][:, None]
 
     def averaged(wavelengths_nm: Float[Array, " k"]) -> Float[Array, "orders n"]:
         lag = frequency * (wavelengths_nm * 1e-6 / model.pitch_mm)
-        whole = barred_overlap(lag, opened, bar_width, bar_place)[None]
-        return jnp.concatenate([whole, slit_coefficients(lag, opened, highest)[1:]]) @ triangle
+        return slit_coefficients(lag, opened, highest)[1:] @ triangle
 
-    table = jnp.moveaxis(jax.lax.map(averaged, fine), 0, -1)
-    return table[:, :count], table[:, count:]
+    above = jnp.moveaxis(jax.lax.map(averaged, fine), 0, -1)
+    columns, rows = opening_overlaps(model, slits, fx, fy, False)
+    return jnp.concatenate([columns, above[:, :count]]), jnp.concatenate([rows, above[:, count:]])
 
 
 def _fine_count(model: Diffraction) -> int:

@@ -28,8 +28,8 @@ from udccal.models.lattice import Lattice
 
 # (g, h): periods along columns and rows. Each term includes its opposite (-g, -h).
 TERMS = ((0.0, 1.0), (0.0, 2.0), (1.0, 0.0), (2.0, 0.0), (1.0, 1.0), (1.0, -1.0))
-_COLUMN_OF, _ROW_OF = np.abs(np.array(TERMS, dtype=np.int32)).T
-HIGHEST_ORDER = int(max(_COLUMN_OF.max(), _ROW_OF.max()))
+COLUMN_OF, ROW_OF = np.abs(np.array(TERMS, dtype=np.int32)).T
+HIGHEST_ORDER = int(max(COLUMN_OF.max(), ROW_OF.max()))
 _QUADRATURE = 32
 _TABLE = 128
 
@@ -60,8 +60,8 @@ def interference_transfer(
         total: Float[Array, "3 rows half"], node: tuple[Array, Array, Array, Array]
     ) -> tuple[Float[Array, "3 rows half"], None]:
         column, row, overlap, part = node
-        down = strength[:, None] * row[_ROW_OF]
-        here = jnp.sum(down[:, :, None] * column[_COLUMN_OF][:, None, :] * overlap, axis=0)
+        down = strength[:, None] * row[ROW_OF]
+        here = jnp.sum(down[:, :, None] * column[COLUMN_OF][:, None, :] * overlap, axis=0)
         return total + part[:, None, None] * here, None
 
     nodes = (jnp.moveaxis(columns, -1, 0), jnp.moveaxis(rows, -1, 0), jnp.asarray(overlaps), spectra.T)

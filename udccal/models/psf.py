@@ -58,7 +58,6 @@ class PsfField(eqx.Module):
     fine: int = eqx.field(static=True, default=8)
 
 
-@eqx.filter_jit
 def psf_kernels(
     field: PsfField, positions_px: Float[Arrayish, "n 2"], rows: int, columns: int
 ) -> Float[Array, "n 3 rows columns"]:
@@ -69,14 +68,22 @@ def psf_kernels(
         positions_px: (x, y) of each source on the sensor, which is the centre of the kernel's middle sample.
         rows: odd number of rows. columns: odd number of columns.
     """
+    corner = field.diffraction.corner
+    rounded = isinstance(corner, jax.core.Tracer) or float(corner) > 0.0
+    return _kernels(field, jnp.asarray(positions_px), rows, columns, rounded)
 
+
+@eqx.filter_jit
+def _kernels(
+    field: PsfField, positions_px: Float[Array, "n 2"], rows: int, columns: int, rounded: bool
+) -> Float[Array, "n 3 rows columns"]:
     def one(position: Float[Array, "2"]) -> Float[Array, "3 rows columns"]:
         kernel = field.diffraction_fraction * diffraction_kernel(
-            field.diffraction, field.geometry, position, rows, columns, field.fine
+            field.diffraction, field.geometry, position, rows, columns, field.fine, rounded
         ) + residual_kernel(field, position, rows, columns)
         return kernel / jnp.sum(kernel, axis=(1, 2), keepdims=True)
 
-    return jax.lax.map(one, jnp.asarray(positions_px))
+    return jax.lax.map(one, positions_px)
 
 
 def fine_oversample(pupil_diameter_mm: float, focal_px: float) -> int:
@@ -91,7 +98,13 @@ def fine_oversample(pupil_diameter_mm: float, focal_px: float) -> int:
 
 
 def diffraction_kernel(
-    model: Diffraction, geometry: Geometry, position_px: Float[Arrayish, "2"], rows: int, columns: int, fine: int = 8
+    model: Diffraction,
+    geometry: Geometry,
+    position_px: Float[Arrayish, "2"],
+    rows: int,
+    columns: int,
+    fine: int = 8,
+    rounded: bool = True,
 ) -> Float[Array, "3 rows columns"]:
     """Return the kernel by diffraction alone, as a fraction of all the source's light."""
     frame = local_frame(geometry, position_px)
@@ -100,7 +113,7 @@ def diffraction_kernel(
     offsets = jnp.stack([x.ravel(), y.ravel()], axis=-1) * 1.0
     points, density = lattice_points(geometry, frame, position_px, offsets)
     size_px = (max(rows, _LEAST_PX), max(columns, _LEAST_PX))
-    values = _cross(lambda grid: average_transfer(model, frame, grid, spectra), points, size_px, fine)
+    values = _cross(lambda grid: average_transfer(model, frame, grid, spectra, rounded=rounded), points, size_px, fine)
     close_y, close_x = (min(size, most) * _MARGIN for size, most in zip(size_px, _INTERFERENCE_PX, strict=True))
     grid = lattice_for(close_y, close_x, _INTERFERENCE_PER_PX, _INTERFERENCE_PER_PX)
     overlaps = node_overlaps(model, frame, grid, overlap_tables(model, frame))

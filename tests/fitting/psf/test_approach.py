@@ -1,4 +1,4 @@
-"""An opaque bar through the panel's openings: found where there is one, with its width and place, and only there."""
+"""Round corners of the panel's openings and an opaque bar through them are found where they are, and only there."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.scenes.psf import pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction
 from udccal.fitting.psf.fit import _estimates
-from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, DEPTH_RATIO
+from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, CORNER, DEPTH_RATIO
 from udccal.fitting.psf.start import start_model, start_prior
 from udccal.numerics import in_float64
 
@@ -19,13 +19,13 @@ _RATIO = 0.25
 
 
 @in_float64
-def fitted(axis: int, width: float, place: float) -> tuple[DiffractionFit, np.ndarray]:
-    """A fit to pictures by a panel with such a bar, and with rows deeper than columns; its true parameters."""
+def fitted(axis: int, width: float, place: float, corner: float = 0.0) -> tuple[DiffractionFit, np.ndarray]:
+    """A fit to pictures by a panel with such openings, and with rows deeper than columns; its true parameters."""
     scene = small_scene(positions=(3, 2), shifts=2, half=(24, 10))
     start = start_model(scene.rig, scene.geometry, scene.wire)
     prior = start_prior(scene.rig, start)
     rng, true = np.random.default_rng(5), prior.mean.copy()
-    true[DEPTH_RATIO], true[BAR_WIDTH][axis], true[BAR_PLACE][axis] = _RATIO, width, place
+    true[DEPTH_RATIO], true[BAR_WIDTH][axis], true[BAR_PLACE][axis], true[CORNER] = _RATIO, width, place, corner
     shots = shots_of(scene, pictures(scene, true, rng), rng)
     rules = replace(PsfRules(), close_px=scene.half)
     return fit_diffraction(shots, scene.geometry, start, prior, rules), true
@@ -37,8 +37,8 @@ def test_a_bar_is_found_with_its_width_and_place(axis: int, width: float, place:
     fit, true = fitted(axis, width, place)
     assert fit.converged
     assert fit.bar_axis == axis
-    assert fit.bar is not None
-    assert ("columns", "rows")[axis] in fit.bar.best.name
+    assert fit.shape is not None
+    assert ("columns", "rows")[axis] in fit.shape.best.name
     sigma = np.sqrt(np.diag(fit.cov()))
     for part in (BAR_WIDTH, BAR_PLACE):
         # Kernels do not tell on which side of the middle it is.
@@ -54,11 +54,27 @@ def test_a_bar_is_found_with_its_width_and_place(axis: int, width: float, place:
 
 
 @pytest.mark.medium
-def test_openings_without_a_bar_have_none() -> None:
+@pytest.mark.parametrize("corner", [0.08, 0.15])
+def test_round_corners_are_found_with_their_radius(corner: float) -> None:
+    fit, _ = fitted(0, 0.0, 0.0, corner)
+    assert fit.converged
+    assert fit.bar_axis is None
+    assert fit.shape is not None
+    # A bar was not looked for: openings with round corners fit.
+    assert [one.name for one in fit.shape.tried] == ["plain openings (BIC)", "round corners (BIC)"]
+    radius = _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0][-2]
+    assert radius.name == "corner_radius"
+    assert abs(radius.value - corner) < 4.5 * radius.sigma
+    assert radius.sigma < 0.1 * corner
+
+
+@pytest.mark.medium
+def test_plain_openings_have_neither_bar_nor_corners() -> None:
     fit, _ = fitted(0, 0.0, 0.0)
     assert fit.converged
     assert fit.bar_axis is None
-    assert fit.bar is not None
-    assert not any("bar" in one.name for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0])
-    # None was looked for: openings without one fit.
-    assert [one.name for one in fit.bar.tried] == ["openings without a bar (BIC)"]
+    assert fit.shape is not None
+    names = {one.name for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
+    assert not {name for name in names if "bar" in name or "corner" in name}
+    # None was looked for: openings without fit.
+    assert [one.name for one in fit.shape.tried] == ["plain openings (BIC)"]

@@ -13,8 +13,8 @@ from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.kernel import (
-    BAR_PLACE,
     BAR_WIDTH,
+    CORNER,
     HEAD,
     PITCH,
     PUPIL,
@@ -32,8 +32,8 @@ from udccal.rig import RigDescription
 _HALF = (8, 6)
 # Forward and backward, of each parameter before the spectra.
 _LENS = [1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3]
-_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, *_LENS, 1e-3, *4 * [1e-5], 1e-4, 1e-4, 1e-4])
-_BARS = slice(BAR_WIDTH.start, BAR_PLACE.stop)
+_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, *_LENS, 1e-3, *4 * [1e-5], 1e-4, 1e-4, 1e-4, 1e-4])
+_SHAPE = slice(BAR_WIDTH.start, CORNER + 1)
 
 
 @pytest.fixture(scope="module")
@@ -53,17 +53,17 @@ def shots(scene: Scene, prior: Prior) -> Shots:
 
 
 @pytest.mark.parametrize(
-    ("interference", "barred"), [pytest.param(True, False, marks=pytest.mark.slow), (False, False), (False, True)]
+    ("interference", "shaped"), [pytest.param(True, False, marks=pytest.mark.slow), (False, False), (False, True)]
 )
 @pytest.mark.medium
 def test_slopes_of_the_kernel_are_those_of_differences(
-    scene: Scene, prior: Prior, shots: Shots, interference: bool, barred: bool
+    scene: Scene, prior: Prior, shots: Shots, interference: bool, shaped: bool
 ) -> None:
-    found, wanted = slopes_both_ways(scene, prior, shots, interference, barred)
-    assert (np.abs(found[_BARS]).max(axis=(1, 2, 3)) > 0).all() == barred
-    if not barred:
-        assert not found[_BARS].any()
-        found, wanted = (np.delete(one, _BARS, axis=0) for one in (found, wanted))
+    found, wanted = slopes_both_ways(scene, prior, shots, interference, shaped)
+    assert (np.abs(found[_SHAPE]).max(axis=(1, 2, 3)) > 0).all() == shaped
+    if not shaped:
+        assert not found[_SHAPE].any()
+        found, wanted = (np.delete(one, _SHAPE, axis=0) for one in (found, wanted))
     for own, other in zip(found, wanted, strict=True):
         assert np.abs(own - other).max() <= 0.01 * np.abs(other).max()
     swapped = np.abs(found[1] - wanted[2]).max()
@@ -72,11 +72,11 @@ def test_slopes_of_the_kernel_are_those_of_differences(
 
 @in_float64
 def slopes_both_ways(
-    scene: Scene, prior: Prior, shots: Shots, interference: bool, barred: bool
+    scene: Scene, prior: Prior, shots: Shots, interference: bool, shaped: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     problem = problem_of(scene, prior, shots, interference)
-    one, theta, evaluator = problem.samples.at(0), prior.mean.copy(), replace(problem.evaluator, barred=barred)
-    theta[_BARS] = np.array([0.03, 0.05, 0.1, -0.08]) * barred
+    one, theta, evaluator = problem.samples.at(0), prior.mean.copy(), replace(problem.evaluator, shaped=shaped)
+    theta[_SHAPE] = np.array([0.03, 0.05, 0.1, -0.08, 0.12]) * shaped
     made, chain = (np.asarray(p) for p in evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps))
     by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
     found = np.einsum("yxfc,fcp->pyxc", by_factor, chain)

@@ -1,8 +1,8 @@
 """First descents of a fit of diffraction: from the prior's mean to near the minimum.
 
-Where openings do not fit, an opaque bar through them is looked for, such as a wire of the panel. A bar of a few
-hundredths of a period changes kernels by ten per cent and more. Its place has several minima: descents begin at some
-places on each axis.
+Where plain openings do not fit, round corners are looked for, and then an opaque bar, such as a wire of the panel.
+Corners of a tenth of a period and bars of a few hundredths change kernels by ten per cent and more. A bar's place has
+several minima: descents begin at some places on each axis.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import PsfRules
-from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, FOOTPRINT, OPENINGS, PUPIL, Own, Samples, Theta
+from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, CORNER, FOOTPRINT, OPENINGS, PUPIL, Own, Samples, Theta
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
 from udccal.numerics import in_two_threads
 
@@ -36,25 +36,37 @@ class Approach:
     problem: DiffractionProblem
     end: Solution[Place, Blocks]
 
-    def attempt(self, name: str) -> Attempt[Approach]:
+    @property
+    def misfit(self) -> float:
+        """The cost by sample."""
+        return self.end.equations.cost / self.problem.used
+
+    def attempt(self) -> Attempt[Approach]:
         """As an order that BIC compares to others."""
-        unknowns = self.problem.unknowns + _OF_BAR * self.problem.evaluator.barred
+        prior = self.problem.prior
+        bars = [f"a bar through openings of {_AXES[axis]}" for axis in np.flatnonzero(prior.mean[BAR_WIDTH])]
+        corners = ["round corners"] * bool(prior.mean[CORNER])
+        unknowns = self.problem.unknowns + len(corners) + _OF_BAR * len(bars)
         criterion = bic(self.end.equations.cost, float(unknowns), self.problem.used)
-        return Attempt(name, unknowns, criterion, self)
+        return Attempt(f"{', '.join([*corners, *bars]) or 'plain openings'} (BIC)", unknowns, criterion, self)
 
 
 def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
-    """Return the approach with openings as they are, or with a bar on the axis that explains the data best.
+    """Return the approach with plain openings, or with corners or a bar where they explain the data better (BIC).
 
-    A bar is looked for where openings without one do not fit; BIC compares the two.
+    Each is looked for where what came before it does not fit.
     """
     problem = replace(problem, samples=problem.samples.weighed(rules.first_model_error))
     plain = Approach(problem, _from_mean(problem, rules))
-    attempts = [plain.attempt("openings without a bar (BIC)")]
-    if plain.end.equations.cost > rules.barred_from * problem.used:
-        axis, found = _with_bar(plain, rules)
-        if found.end.place.theta[BAR_WIDTH][axis] > rules.least_bar:
-            attempts.append(found.attempt(f"a bar through openings of {_AXES[axis]} (BIC)"))
+    attempts, own = [plain.attempt()], plain.end.place.own
+    shaped = replace(problem, evaluator=replace(problem.evaluator, shaped=True))
+    if plain.misfit > rules.shaped_from:
+        prior = shaped_prior(problem.prior, rules)
+        attempts.append(_descended(replace(shaped, prior=prior), prior.mean, own, rules).attempt())
+    if choose(attempts).best.fit.misfit > rules.shaped_from:
+        barred = _with_bar(shaped, own, rules)
+        if barred.end.place.theta[BAR_WIDTH].max() > rules.least_bar:
+            attempts.append(barred.attempt())
     return choose(attempts)
 
 
@@ -85,35 +97,47 @@ def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, 
     return minimise(problem, problem.at(prior.mean, own), solver_rules(1e-3 * problem.used, rules.iterations))
 
 
-def _with_bar(plain: Approach, rules: PsfRules) -> tuple[int, Approach]:
+def _descended(problem: DiffractionProblem, theta: Theta, own: Own, rules: PsfRules) -> Approach:
+    """Go from a place until a step gains a thousandth of the cost."""
+    end = minimise(problem, problem.at(theta, own), solver_rules(1e-3 * problem.used, rules.iterations))
+    return Approach(problem, end)
+
+
+def _descended(problem: DiffractionProblem, theta: Theta, own: Own, rules: PsfRules) -> Approach:
+    """Go from a place until a step gains a thousandth of the cost."""
+    end = minimise(problem, problem.at(theta, own), solver_rules(1e-3 * problem.used, rules.iterations))
+    return Approach(problem, end)
+
+
+def _with_bar(problem: DiffractionProblem, own: Own, rules: PsfRules) -> Approach:
     """Begin at every place on both axes for a few steps with some positions, and go on from the best with all."""
-    problem = replace(plain.problem, evaluator=replace(plain.problem.evaluator, barred=True))
-    own, tried = plain.end.place.own, []
+    tried = []
     # Positions spread over the field; the first steps need no more.
     spread = np.unique(np.linspace(0, len(own) - 1, rules.bar_positions).round().astype(int))
     few, enough = replace(problem, samples=problem.samples.at(spread)), 1e-3 * problem.used
     for axis, part in product(range(2), rules.bar_places):
-        prior = barred_prior(problem.prior, axis, part * float(problem.prior.mean[OPENINGS][axis]), rules)
+        prior = shaped_prior(problem.prior, rules, (axis, part * float(problem.prior.mean[OPENINGS][axis])))
         begun = replace(few, prior=prior)
         end = minimise(begun, begun.at(prior.mean, own[spread]), solver_rules(enough, rules.bar_steps))
-        tried.append((end.equations.cost, axis, prior, end.place.theta))
+        tried.append((end.equations.cost, prior, end.place.theta))
         LOG.debug("psf: a bar from %.2f of openings of %s, cost %.6g", part, _AXES[axis], end.equations.cost)
-    _, axis, prior, theta = min(tried, key=lambda one: one[0])
-    problem = replace(problem, prior=prior)
-    solution = minimise(problem, problem.at(theta, own), solver_rules(enough, rules.iterations))
-    return axis, Approach(problem, solution)
+    _, prior, theta = min(tried, key=lambda one: one[0])
+    return _descended(replace(problem, prior=prior), theta, own, rules)
 
 
-def barred_prior(prior: Prior, axis: int, place: float, rules: PsfRules) -> Prior:
-    """Return the ``prior`` of openings without a bar, with one at ``place`` on an axis.
+def shaped_prior(prior: Prior, rules: PsfRules, bar: tuple[int, float] | None = None) -> Prior:
+    """Return the ``prior`` of plain openings, with round corners and perhaps a bar at a place (periods) on an axis.
 
-    The openings have the rig's whole tolerances again: the wire has measured them as if there were no bar.
+    The openings have the rig's whole tolerances again: the wire has measured them as if they were plain.
     """
     mean, root = prior.mean.copy(), prior.root.copy()
-    mean[BAR_WIDTH][axis], mean[BAR_PLACE][axis] = rules.bar_width, place
-    for part, sigma in zip((BAR_WIDTH, BAR_PLACE), rules.bar_sigma, strict=True):
-        number = part.start + axis
-        root[number, number] = 1.0 / sigma
+    shape = [(CORNER, rules.corner, rules.corner)]
+    if bar is not None:
+        axis, place = bar
+        shape.append((BAR_WIDTH.start + axis, rules.bar_width, rules.bar_sigma[0]))
+        shape.append((BAR_PLACE.start + axis, place, rules.bar_sigma[1]))
+    for number, value, sigma in shape:
+        mean[number], root[number, number] = value, 1.0 / sigma
     root[OPENINGS] *= rules.wire_tolerance
     return Prior(mean, root)
 

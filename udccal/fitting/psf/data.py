@@ -56,10 +56,11 @@ class PsfRules:
         blur_px, blur_log_sigma: prior of the blur in addition to pixel and disc: value, and sigma of its logarithm.
         blur_growth, blur_colour: prior sigmas of that logarithm's growth over a focal length, and between colours.
         depth_ratio: prior sigma of the logarithm of the rows' depth over the columns'.
+        shaped_from: squared residuals by ``first_model_error`` from which round corners and bars are looked for.
+        corner: mean and prior sigma of the radius of round corners, in periods.
         bar_width, bar_sigma: of an opaque bar through the openings: its width at first, and prior sigmas of width and
             place, in periods.
         least_bar: width in periods below which there is no bar.
-        barred_from: squared residuals by ``first_model_error`` from which a bar is looked for.
         bar_places: distances of the bar's middle from the opening's that are tried first, as parts of the opening.
         bar_positions, bar_steps: field positions of these first tries, and their steps.
         wire_tolerance: part of the rig's tolerances that is left after the wire's fit.
@@ -101,10 +102,11 @@ class PsfRules:
     blur_growth: float = 1.0
     blur_colour: float = 0.2
     depth_ratio: float = 0.2
+    shaped_from: float = 1.5
+    corner: float = 0.1
     bar_width: float = 0.02
     bar_sigma: tuple[float, float] = (0.03, 0.1)
     least_bar: float = 0.003
-    barred_from: float = 1.5
     bar_places: tuple[float, ...] = (0.05, 0.15, 0.3, 0.42)
     bar_positions: int = 3
     bar_steps: int = 4

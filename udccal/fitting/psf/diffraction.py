@@ -46,7 +46,7 @@ class DiffractionFit:
         shots: the data, at the places that the samples are about.
         model_error: as a fraction of the peak, see ``data.left_out``; 0 where the residuals are noise.
         iterations: sum over all descents.
-        bar: comparison by BIC of openings without an opaque bar to openings with one.
+        shape: comparison by BIC of plain openings to those with round corners or an opaque bar.
         phase: comparison by BIC of a kernel with the wire's phase to one averaged over it; None where no wire was
             seen. The fits are the phase's strength in the kernel (1 where it agrees with the wire, 0 where the kernel
             does not show it) and its sigma.
@@ -58,7 +58,7 @@ class DiffractionFit:
     model_error: float
     outliers: tuple[Outliers, ...]
     iterations: int
-    bar: Choice[Approach] | None = None
+    shape: Choice[Approach] | None = None
     phase: Choice[tuple[float, float]] | None = None
 
     @property
@@ -149,9 +149,9 @@ def fit_diffraction(
     chosen, lattice = choose_samples(shots, rules), fit_lattice(rules.close(shots.half))
     evaluator = Evaluator(np.asarray(start.wavelengths_nm), lattice, bool(start.visibility))
     problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
-    bar = approach(problem, rules)
-    for attempt in (bar.best, bar.tried[0]):
-        fit = replace(_finish(attempt.fit, shots, geometry, chosen, rules), bar=Choice(attempt, bar.tried))
+    shape = approach(problem, rules)
+    for attempt in sorted(shape.tried, key=lambda one: one.criterion):
+        fit = replace(_finish(attempt.fit, shots, geometry, chosen, rules), shape=Choice(attempt, shape.tried))
         # A bar that vanishes at the minimum was none.
         if fit.bar_axis is None or fit.theta[BAR_WIDTH][fit.bar_axis] > rules.least_bar:
             break

@@ -33,7 +33,7 @@ from udccal.fitting.psf.held_out import (
     with_support,
 )
 from udccal.fitting.psf.image import Magnitude
-from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, BLUR, PITCH
+from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, BLUR, CORNER, PITCH
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.start import as_numpy, pitch_tolerance, some_shots, start_model, start_prior
@@ -49,9 +49,9 @@ from udccal.rig import RigDescription
 _DIFFRACTION: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm")
 _BLUR: Final = ("blur_px", "blur_growth_radial", "blur_growth_tangential", "blur_red", "blur_blue")
 _NUMBERS: Final = (*_DIFFRACTION, *_BLUR, "depth_ratio")
-# Of a bar through openings of (columns, rows), where there is one.
-BARS: Final = ("column_bar_width", "row_bar_width", "column_bar_place", "row_bar_place")
-_NAMES: Final = (*_NUMBERS, *BARS)
+# Of a bar through openings of (columns, rows) and of round corners, where there are such.
+SHAPE: Final = ("column_bar_width", "row_bar_width", "column_bar_place", "row_bar_place", "corner_radius")
+_NAMES: Final = (*_NUMBERS, *SHAPE)
 # Diagnostics that say what sigma would be if the model had no deviation; of these numbers.
 NOISE_SIGMA: Final = "noise_sigma_"
 # Units of diagnostics that have one.
@@ -186,7 +186,7 @@ def _report(
     if diffracts:
         l2_sigma = float(np.hypot(by_parameters, spread))
         numbers, cov_of_numbers = _estimates(fit, cov, l2, l2_sigma, pitch_tolerance(rig))
-    compared = [choice for choice in (fit.bar, fit.phase) if choice and len(choice.tried) > 1]
+    compared = [choice for choice in (fit.shape, fit.phase) if choice and len(choice.tried) > 1]
     along = (candidate for choice in support for candidate in choice.candidates)
     term, open_ended = with_support(term, support, rig)
     places = fit.shots.centre_px[np.broadcast_to(problem.samples.index[..., None], used.shape)[used]]
@@ -238,9 +238,9 @@ def _estimates(
 
 
 def _numbers_found(fit: DiffractionFit) -> list[int]:
-    """Return the indices of the numbers that the fit has determined: those of a bar only where there is one."""
+    """Return the indices of the numbers that the fit has determined: those of bar and corners only where they are."""
     bar = () if fit.bar_axis is None else (BAR_WIDTH.start + fit.bar_axis, BAR_PLACE.start + fit.bar_axis)
-    return [*range(len(_NUMBERS)), *bar]
+    return [*range(len(_NUMBERS)), *bar, *([CORNER] if fit.problem.prior.mean[CORNER] else [])]
 
 
 def _posterior(
@@ -299,6 +299,8 @@ def _notes(
         if fit.bar_axis is not None:
             of, wide = ("columns", "rows")[fit.bar_axis], fit.theta[BAR_WIDTH][fit.bar_axis]
             notes += [f"A bar {wide:.3f} of a period wide crosses the openings of {of}, such as a wire of the panel."]
+        if fit.problem.prior.mean[CORNER]:
+            notes += [f"The openings' corners are round, with a radius of {fit.theta[CORNER]:.3f} of a period."]
     notes += [off] if off else []
     if data.doubted:
         notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")

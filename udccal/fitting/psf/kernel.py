@@ -10,6 +10,7 @@ Own parameters of a shot are (x, y) in px from the first assumed place, light pe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final, final
 
@@ -29,6 +30,7 @@ from udccal.models.diffraction import (
     blur_variance,
     lattice_frequencies,
     local_frame,
+    opening_overlaps,
     pupil_anchors,
     pupil_overlaps,
     sensor_transfer,
@@ -37,8 +39,9 @@ from udccal.models.diffraction import (
 )
 from udccal.models.geometry import Geometry
 from udccal.models.interference import (
+    COLUMN_OF,
     HIGHEST_ORDER,
-    TERMS,
+    ROW_OF,
     footprint_place,
     interference_transfer,
     node_overlaps,
@@ -52,11 +55,11 @@ WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 # Nodes of a fit's lattice to a pixel.
 PER_PX: Final = 4
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
-# in mm, the logarithm of the blur in px, bars of (columns, rows), and the footprint's place on columns and rows with
-# its stand-off, in pitches.
-HEAD: Final = 18
+# in mm, the logarithm of the blur in px, bars of (columns, rows), round corners, and the footprint's place on columns
+# and rows with its stand-off, in pitches.
+HEAD: Final = 19
 PITCH, PUPIL, BLUR, GROWTH, BLUR_RED, BLUR_BLUE, DEPTH_RATIO = 0, 4, 5, slice(6, 8), 8, 9, 10
-OPENINGS, BAR_WIDTH, BAR_PLACE, FOOTPRINT = slice(1, 3), slice(11, 13), slice(13, 15), slice(15, 18)
+OPENINGS, BAR_WIDTH, BAR_PLACE, CORNER, FOOTPRINT = slice(1, 3), slice(11, 13), slice(13, 15), 15, slice(16, 19)
 OWN: Final = 6
 _PER_SAMPLE = ("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps")
 # Parameters of diffraction; own parameters and light of the shots, of one position or of all.
@@ -66,6 +69,8 @@ Light = Float[np.ndarray, "*positions shots n"]
 # Spline coefficients of a kernel about its position.
 Kernel = Float[np.ndarray, "y x 3"]
 Overlaps = Float[Arrayish, "nodes terms rows half"]
+# Tables of slits of columns and of rows.
+Tables = tuple[Array, Array]
 
 
 @final
@@ -76,13 +81,13 @@ class Evaluator(eqx.Module):
         wavelengths_nm: nodes of the spectra.
         lattice: of kernels.
         interference: whether the footprint's place on rows is known.
-        barred: whether bars may be in the openings. Without, their parameters have no derivatives, which saves time.
+        shaped: whether openings may have bars and round corners. Without, these have no derivatives, which saves time.
     """
 
     wavelengths_nm: Float[Arrayish, " nodes"]
     lattice: Lattice = eqx.field(static=True)
     interference: bool = eqx.field(static=True)
-    barred: bool = eqx.field(static=True, default=False)
+    shaped: bool = eqx.field(static=True, default=False)
 
     def model(self, theta: Float[Arrayish, " p"]) -> Diffraction:
         """Return the model of a vector of parameters; see ``start.pack``."""
@@ -94,6 +99,7 @@ class Evaluator(eqx.Module):
             depth_ratio=theta[DEPTH_RATIO],
             bar_width=theta[BAR_WIDTH],
             bar_place=theta[BAR_PLACE],
+            corner=theta[CORNER],
             pupil_diameter_mm=theta[PUPIL],
             blur_px=jnp.exp(theta[BLUR]),
             blur_growth=theta[GROWTH],
@@ -119,7 +125,7 @@ class Evaluator(eqx.Module):
     ) -> Float[Array, "lattice_rows lattice_columns 3"]:
         """Return spline coefficients of the three colours' kernels, for a source whose image is ``disc_px`` wide."""
         model, lattice = self.model(theta), self.lattice
-        transfer = average_transfer(model, frame, lattice, jnp.asarray(model.spectrum), disc_px)
+        transfer = average_transfer(model, frame, lattice, jnp.asarray(model.spectrum), disc_px, self.shaped)
         if self.interference:
             transfer += interference_transfer(model, frame, lattice, jnp.asarray(model.spectrum), overlaps, disc_px)
         return spline_coefficients(lattice, transfer)
@@ -131,9 +137,8 @@ class Evaluator(eqx.Module):
         """Return spline coefficients of the kernel at every wavelength node, and its derivatives by factor and colour.
 
         Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the
-        footprint's place (x, y), bars if there may be any, and the blur's covariance, with the ``overlaps`` of
-        interference held. The second result has their derivatives by the parameters before the spectra. The average
-        over the footprint's place is one more term of interference, (0, 0), of strength 1.
+        footprint's place (x, y), bars and corners if there may be any, and the blur's covariance, with the ``overlaps``
+        of interference held. The second result has their derivatives by the parameters before the spectra.
         """
         model, lattice = self.model(theta), self.lattice
         spectra, variance = jnp.asarray(model.spectrum), blur_variance(model, frame)
@@ -146,30 +151,30 @@ class Evaluator(eqx.Module):
         sensor, along = jax.linearize(lambda at: sensor_transfer(frame, fx, fy, at, disc_px), variance)
         # Each colour depends on its own variance.
         by_blur = jax.vmap(lambda way: along(jnp.tile(way, (3, 1))))(jnp.eye(3, dtype=variance.dtype))
-        place, terms = footprint_place(model, frame), np.array([(0.0, 0.0), *TERMS][: 1 + np.shape(overlaps)[1]])
-        column_of, row_of = np.abs(terms).astype(np.int32).T
-        strength = jnp.append(1.0, strengths(model, place))[: len(terms), None]
-        by_place = jnp.pad(jax.jacfwd(lambda at: strengths(model, at))(place), ((1, 0), (0, 0)))[: len(terms)]
+        place, slits, terms = footprint_place(model, frame), slits_along(model, frame), np.shape(overlaps)[1]
+        column_of, row_of = COLUMN_OF[:terms], ROW_OF[:terms]
+        strength = strengths(model, place)[:terms, None]
+        by_place = jax.jacfwd(lambda at: strengths(model, at)[:terms])(place)
 
-        def at_node(node: tuple[Array, Array, Array, Array]) -> Float[Array, "variants rows half"]:
-            columns, rows, own, part = node
-            (column, *column_bar), (row, *row_bar) = ([one[0] for one in (*by[:1], *by[3:])] for by in (columns, rows))
+        def at_node(node: tuple[Tables, Tables, Array, Array]) -> Float[Array, "variants rows half"]:
+            (columns, rows), of_orders, own, part = node
             average, narrower = (jnp.tensordot(part, anchors, 1) for anchors in (pupils, by_pupil))
-            overlap = jnp.concatenate([average[None], own])
-            x, by_open_x, by_pitch_x = columns[:3, column_of, None, :] * overlap
-            y, by_open_y, by_pitch_y = strength * rows[:3, row_of]
+            x, y = of_orders[0][:, column_of, None, :] * own, strength * of_orders[1][:, row_of]
 
-            def light(down: Array, across: Array) -> Float[Array, "rows half"]:
+            def light(across: int, down: int) -> Float[Array, "rows half"]:
+                return (rows[down].T @ columns[across]) * average + between(x[across], y[down])
+
+            def between(across: Array, down: Array) -> Float[Array, "rows half"]:
                 return jnp.sum(down[..., None] * across, axis=0)
 
-            by_pitch, pupil = light(y, by_pitch_x) + light(by_pitch_y, x), row[:, None] * column * narrower
-            moved = [light(by[:, None] * rows[0, row_of], x) for by in by_place.T]
-            pairs = [(by, row) for by in column_bar] + [(column, by) for by in row_bar]
-            bars = [down[:, None] * across * average for across, down in pairs]
-            return jnp.stack([light(y, x), light(y, by_open_x), light(by_open_y, x), by_pitch, pupil, *moved, *bars])
+            moved = [between(x[0], by[:, None] * of_orders[1][0, row_of]) for by in by_place.T]
+            shape = [rows[0].T @ by for by in columns[3:]] + [by.T @ columns[0] for by in rows[3:]]
+            widths = [light(0, 0), light(1, 0), light(0, 1), light(2, 0) + light(0, 2)]
+            return jnp.stack([*widths, (rows[0].T @ columns[0]) * narrower, *moved, *(by * average for by in shape)])
 
-        slits = self._slits(model, frame, fx, fy)
-        every = jax.lax.map(at_node, (*slits, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
+        parts = self._parts(model, slits, fx, fy)
+        orders = self._tables(lambda m, s: slits_of(m, s, fx, fy, HIGHEST_ORDER), model, slits, 2)
+        every = jax.lax.map(at_node, (parts, orders, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
         # As one product of matrices: an einsum over the nodes takes five times as long.
         mixed = (spectra @ every.reshape(len(every), -1)).reshape(len(spectra), *every.shape[1:])
         by_factor = jax.lax.map(lambda one: one * sensor, jnp.swapaxes(mixed[:, 1:], 0, 1))
@@ -179,30 +184,40 @@ class Evaluator(eqx.Module):
 
         def factors(head: Float[Array, " head"]) -> Float[Array, "factors 3"]:
             model = self.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
-            slits, place = slits_along(model, frame), footprint_place(model, frame)
-            bars = jnp.stack([slits.bar_width, slits.bar_place], axis=1).ravel()[: 4 * self.barred]
-            common = jnp.concatenate([slits.opened, head[jnp.array([PITCH, PUPIL])], place, bars])
+            slits = slits_along(model, frame)
+            shape = jnp.stack([slits.bar_width, slits.bar_place, slits.corner], axis=1).ravel()[: 6 * self.shaped]
+            others = head[jnp.array([PITCH, PUPIL])], footprint_place(model, frame)
+            common = jnp.concatenate([slits.opened, *others, shape])
             return jnp.concatenate([jnp.tile(common[:, None], (1, 3)), blur_variance(model, frame).T])
 
         return spline_coefficients(lattice, seen), jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
 
-    def _slits(
-        self, model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
-    ) -> tuple[Float[Array, "nodes ways orders half"], Float[Array, "nodes ways orders rows"]]:
-        """Return slits of both axes, and derivatives by open part, by pitch with the others held, and by bars."""
+    def _tables(
+        self, of_slits: Callable[[Diffraction, Slits], Tables], model: Diffraction, slits: Slits, ways: int
+    ) -> Tables:
+        """Return tables of slits by node; after their values, ``ways`` derivatives by open part, pitch, bar and corner.
 
-        def tables(slits: Slits, pitch_mm: Float[Array, ""]) -> tuple[Array, Array]:
-            return slits_of(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), slits, fx, fy, HIGHEST_ORDER)
+        Columns depend on their own openings, bars and corners alone, as do rows.
+        """
 
-        at = slits_along(model, frame), jnp.asarray(model.pitch_mm)
+        def at(slits: Slits, pitch_mm: Float[Array, ""]) -> Tables:
+            return of_slits(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), slits)
 
-        def changed(way: Float[Array, "4"]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-            # Columns depend on their own openings and bars alone, as do rows.
-            slits = Slits(*(jnp.full(2, part) for part in (way[0], way[2], way[3])))
-            return jax.jvp(tables, at, (slits, way[1]))
+        def changed(way: Float[Array, "5"]) -> tuple[Tables, Tables]:
+            moved = Slits(*(jnp.full(2, way[part]) for part in (0, 2, 3, 4)))
+            return jax.jvp(at, (slits, jnp.asarray(model.pitch_mm)), (moved, way[1]))
 
-        value, derivatives = jax.vmap(changed, out_axes=(None, 0))(jnp.eye(4)[: 4 if self.barred else 2])
+        value, derivatives = jax.vmap(changed, out_axes=(None, 0))(jnp.eye(5)[:ways])
         return jax.tree.map(lambda own, by: jnp.moveaxis(jnp.concatenate([own[None], by]), -1, 0), value, derivatives)
+
+    def _parts(self, model: Diffraction, slits: Slits, fx: Float[Array, " half"], fy: Float[Array, " rows"]) -> Tables:
+        """Return parts of the average and their derivatives, as fractions of what is open, which changes with them."""
+        ways = 5 if self.shaped else 2
+        found = self._tables(lambda m, s: opening_overlaps(m, s, fx, fy, self.shaped), model, slits, ways)
+        opened, by = jax.value_and_grad(lambda at: at.open_part(self.shaped))(slits)
+        grown = jnp.stack([jnp.zeros(2), by.opened, jnp.zeros(2), by.bar_width, by.bar_place, by.corner]) / opened
+        columns, rows = (part - grown[: ways + 1, axis, None, None] * part[:, :1] for axis, part in enumerate(found))
+        return columns, rows / opened
 
 
 def fit_lattice(half: tuple[int, int]) -> Lattice:
