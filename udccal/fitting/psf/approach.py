@@ -57,7 +57,7 @@ def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
     Each is looked for where what came before it does not fit.
     """
     problem = replace(problem, samples=problem.samples.weighed(rules.first_model_error))
-    plain = Approach(problem, _from_mean(problem, rules))
+    plain = _from_mean(problem, rules)
     attempts, own = [plain.attempt()], plain.end.place.own
     shaped = replace(problem, evaluator=replace(problem.evaluator, shaped=True))
     if plain.misfit > rules.shaped_from:
@@ -83,24 +83,17 @@ def second_approach(problem: DiffractionProblem, theta: Theta, rules: PsfRules) 
         return ()
     held = np.zeros(prior.mean.size, dtype=bool)
     held[FOOTPRINT] = True
-    return (_from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held), rules),)
+    return (_from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held), rules).end,)
 
 
-def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
-    """Go from the prior's mean until a step gains a thousandth of the cost."""
-    prior = problem.prior
+def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Approach:
+    """Begin at the prior's mean."""
+    mean = problem.prior.mean
 
     def start(one: Samples) -> Own:
-        return start_own(one, kernel_of(problem.evaluator, prior.mean, one))
+        return start_own(one, kernel_of(problem.evaluator, mean, one))
 
-    own = np.stack(in_two_threads(start, problem.samples.each()))
-    return minimise(problem, problem.at(prior.mean, own), solver_rules(1e-3 * problem.used, rules.iterations))
-
-
-def _descended(problem: DiffractionProblem, theta: Theta, own: Own, rules: PsfRules) -> Approach:
-    """Go from a place until a step gains a thousandth of the cost."""
-    end = minimise(problem, problem.at(theta, own), solver_rules(1e-3 * problem.used, rules.iterations))
-    return Approach(problem, end)
+    return _descended(problem, mean, np.stack(in_two_threads(start, problem.samples.each())), rules)
 
 
 def _descended(problem: DiffractionProblem, theta: Theta, own: Own, rules: PsfRules) -> Approach:
