@@ -118,6 +118,12 @@ def _lead(world: SimulatedWorld, session: Path, asked: Path) -> None:
 
 def judged(pairs: list[Pair]) -> list[Row]:
     """The person's prompts, what sigmas have become, and the errors of the terms that are aimed."""
+    told = [max(same, key=lambda row: row.value) for same in zip(*(pair.errors() for pair in pairs), strict=True)]
+    return prompts_and_sigmas(pairs) + [replace(row, name=f"guided: {row.name}") for row in told]
+
+
+def prompts_and_sigmas(pairs: list[Pair]) -> list[Row]:
+    """The most prompts of a specimen, and sigmas of the guided captures over those of the commanded ones."""
     rows = [at_most("prompts of the guided capture", max(pair.guided.prompts for pair in pairs), _MOST_PROMPTS, "")]
     for term in _AIMED:
         each = [sigma_ratios(*(getattr(one.profile, term) for one in (p.commanded, p.guided))) for p in pairs]
@@ -132,8 +138,7 @@ def judged(pairs: list[Pair]) -> list[Row]:
     worst = max(ratios, key=lambda name: ratios[name])
     what = f"psf: sigma by noise alone, guided over commanded, worst of {len(ratios)} ({worst})"
     rows.append(at_most(what, ratios[worst], _MOST_SIGMA, ""))
-    told = [max(same, key=lambda row: row.value) for same in zip(*(pair.errors() for pair in pairs), strict=True)]
-    return rows + [replace(row, name=f"guided: {row.name}") for row in told]
+    return rows
 
 
 def sigma_ratios(commanded: FitResult, guided: FitResult) -> dict[str, float]:
