@@ -87,7 +87,7 @@ def truth() -> RigTruth:
 
 
 @pytest.mark.parametrize("lag", [0.1, 0.8, 1.05, 2.3, -1.2])
-@pytest.mark.parametrize("order", [0, 1, 2])
+@pytest.mark.parametrize("order", [1, 2])
 def test_slits_against_a_sum(lag: float, order: int) -> None:
     y = (np.arange(20000) + 0.5) / 20000
     opened = 0.7
@@ -97,7 +97,7 @@ def test_slits_against_a_sum(lag: float, order: int) -> None:
 
     both = open_at(y + lag / 2) & open_at(y - lag / 2)
     expected = (both * np.cos(2 * np.pi * order * y)).mean() / opened
-    assert as_numpy(slit_coefficients)(np.array([lag]), opened, 3)[order, 0] == pytest.approx(expected, abs=3e-4)
+    assert as_numpy(slit_coefficients)(np.array([lag]), opened, 3)[order - 1, 0] == pytest.approx(expected, abs=3e-4)
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.1, 0.31, 0.8, 1.05, -1.2])

@@ -25,7 +25,8 @@ from udccal.models.bessel import sine_cosine
 from udccal.models.geometry import Geometry, panel_directions, rotation_matrix
 from udccal.models.lattice import Frequencies
 
-_FINE_NM = 1.0
+# Of sums over the light of a wavelength node; 1 changes kernels by 2e-6.
+_FINE_NM = 5.0
 # Bars narrower than this are none, in periods.
 _LEAST_BAR = 1e-3
 # A round corner is cut in three steps, at these parts of its radius along either axis: powers of orders that have a
@@ -240,15 +241,15 @@ def disc_autocorrelation(relative_lag: Float[Arrayish, "*n"]) -> Float[Array, "*
 def slit_coefficients(
     relative_lag: Float[Arrayish, "*n"], opened: Float[Arrayish, "*#n"], highest: int
 ) -> Float[Array, "orders *n"]:
-    """Return Fourier coefficients, orders 0 to highest, of a row of slits times itself moved by the lag in pitches.
+    """Return Fourier coefficients, orders 1 to highest, of a row of slits times itself moved by the lag in pitches.
 
     Slits overlap those N pitches away. The common openings are ``opened`` - |lag - N| wide and lie half a pitch further
-    per N. The origin is the middle of an opening. Order 0 is 1 at lag 0.
+    per N. The origin is the middle of an opening. Order 0 would be 1 at lag 0; see ``window_overlap``.
     """
     lag = jnp.asarray(relative_lag)
     whole = jnp.floor(lag)
     here, next_one = jnp.maximum(opened - lag + whole, 0.0), jnp.maximum(opened - 1.0 + lag - whole, 0.0)
-    made = [(here + next_one) / opened]
+    made = []
     odd = 1.0 - 2.0 * jnp.mod(whole, 2.0)
     waves = [sine_cosine(jnp.pi * width) for width in (here, next_one)]
     sines, twice = [(jnp.zeros_like(lag), sine) for sine, _ in waves], [2.0 * cosine for _, cosine in waves]
@@ -325,8 +326,8 @@ def slits_of(
     """Return slit coefficients of columns and of rows, averaged over the light of each wavelength node.
 
     A node's light is a triangle as wide as its distance to its neighbours. High orders therefore smear into a
-    continuum, as they do in daylight, without a node for every nanometre. Orders above 0 are summed in steps of about a
-    nanometre and leave bars out: they move a hundredth of the light, and a bar changes a part of that.
+    continuum, as they do in daylight, without a node for every nanometre. Orders above 0 are summed in steps of some
+    nanometres and leave bars out: they move a hundredth of the light, and a bar changes a part of that.
 
     Args:
         model: the diffraction term.
@@ -346,7 +347,7 @@ def slits_of(
 
     def averaged(wavelengths_nm: Float[Array, " k"]) -> Float[Array, "orders n"]:
         lag = frequency * (wavelengths_nm * 1e-6 / model.pitch_mm)
-        return slit_coefficients(lag, opened, highest)[1:] @ triangle
+        return slit_coefficients(lag, opened, highest) @ triangle
 
     above = jnp.moveaxis(jax.lax.map(averaged, fine), 0, -1)
     columns, rows = opening_overlaps(model, slits, fx, fy, False)
