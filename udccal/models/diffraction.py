@@ -7,7 +7,8 @@ The light sent from direction cosines l0 to l has the transfer function, f in cy
 R is the autocorrelation of the open part of the pupil's footprint at a lag s on the panel. A_h are the Fourier
 coefficients of a row of slits times itself moved by the lag. H_gh is that of the footprint times itself moved by the
 lag. (X, Y) is the footprint's centre in pitches (Goodman, Introduction to Fourier Optics, sections 3.10, 6.3).
-The term g = h = 0 is the average over X and Y, an incoherent sum of diffraction orders. The other terms are the
+The term g = h = 0 is the average over X and Y, an incoherent sum of diffraction orders. With round corners it is a sum
+of products: the opening is a pile of slits, one for each step in which a corner is cut. The other terms are the
 interference between neighbouring orders, which changes as the footprint slides over the rows (see ``interference``).
 Direction cosines along the panel make this exact at any angle: the geometry adds stretch and conical bending.
 """
