@@ -57,7 +57,7 @@ def true_field(truth: RigTruth) -> PsfField:
         depth_ratio=np.float64(0.0),
         bar_width=np.zeros(2),
         bar_place=np.zeros(2),
-        corner=np.float64(0.0),
+        corner_radius=np.float64(0.0),
         pupil_diameter_mm=np.float64(optics.pupil_diameter_mm),
         blur_px=np.float64(0.0),
         blur_growth=np.zeros(2),
@@ -144,7 +144,7 @@ def test_openings_with_round_corners_against_a_sum(lag: Pair, width: float, plac
     assert abs(square - expected) > 4e-3 or max(expected, 1.0 - expected) > 0.999  # that the comparison can fail
 
 
-@pytest.mark.parametrize("spread", [1e-9, 0.02, 0.3])
+@pytest.mark.parametrize("spread", [1e-9, 0.02, 0.3, 0.9])
 def test_an_overlap_of_windows_is_averaged_over_the_spread(spread: float) -> None:
     apart, shift = np.linspace(-1.3, 2.6, 40), spread * (np.arange(-199, 200) / 200)
     triangle = (1 - np.abs(shift) / spread) / 200

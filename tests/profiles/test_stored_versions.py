@@ -131,7 +131,7 @@ def test_what_came_later_is_as_it_was_meant_before(version: int, document: JsonO
     np.testing.assert_array_equal(profile.psf.term.diffraction.blur_growth, growth)
     np.testing.assert_array_equal(profile.psf.term.diffraction.blur_colour, colour)
     # Rows were as deep as columns, and openings were rectangles without a bar.
-    for name in ("depth_ratio", "bar_width", "bar_place", "corner"):
+    for name in ("depth_ratio", "bar_width", "bar_place", "corner_radius"):
         assert f"diffraction.{name}" not in stored
         assert not np.any(getattr(profile.psf.term.diffraction, name))
 

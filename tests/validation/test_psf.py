@@ -44,6 +44,17 @@ def test_the_same_kernels_spots_are_predicted(term: PsfField, data: PsfData) -> 
     assert (named(found, "LED's picture, L2").value or 9.0) < 1.5
 
 
+def test_kernels_of_round_corners_predict_their_own_spots_and_not_those_of_square_ones(
+    term: PsfField, data: PsfData
+) -> None:
+    round_ones = replace(term, diffraction=replace(term.diffraction, corner_radius=np.float64(0.15)))
+    scene, rng = small_scene((2, 2), 2), np.random.default_rng(1)
+    made = pictures(scene, pack(round_ones.diffraction), rng)
+    own = PsfData(shots_of(scene, made, rng), len(made))
+    assert not failed(judge_psf(own, result_of(round_ones), ValidationLimits(), own=False))
+    assert failed(judge_psf(data, result_of(round_ones), ValidationLimits(), own=False))
+
+
 def test_a_defocused_kernel_fails(term: PsfField, data: PsfData) -> None:
     soft = replace(term, diffraction=replace(term.diffraction, blur_px=np.float64(0.8)))
     found = judge_psf(data, result_of(soft), ValidationLimits(), own=False)

@@ -16,7 +16,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udccal.models.arrays import Arrayish
-from udccal.models.diffraction import Diffraction, LocalFrame, average_transfer, local_frame, node_scale
+from udccal.models.diffraction import (
+    Diffraction,
+    LocalFrame,
+    average_transfer,
+    has_round_corners,
+    local_frame,
+    node_scale,
+)
 from udccal.models.fields import polynomial_basis
 from udccal.models.geometry import Geometry, area_of_pixels, panel_directions
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
@@ -68,9 +75,7 @@ def psf_kernels(
         positions_px: (x, y) of each source on the sensor, which is the centre of the kernel's middle sample.
         rows: odd number of rows. columns: odd number of columns.
     """
-    corner = field.diffraction.corner
-    rounded = isinstance(corner, jax.core.Tracer) or float(corner) > 0.0
-    return _kernels(field, jnp.asarray(positions_px), rows, columns, rounded)
+    return _kernels(field, jnp.asarray(positions_px), rows, columns, has_round_corners(field.diffraction))
 
 
 @eqx.filter_jit
@@ -103,8 +108,8 @@ def diffraction_kernel(
     position_px: Float[Arrayish, "2"],
     rows: int,
     columns: int,
-    fine: int = 8,
-    rounded: bool = True,
+    fine: int,
+    rounded: bool,
 ) -> Float[Array, "3 rows columns"]:
     """Return the kernel by diffraction alone, as a fraction of all the source's light."""
     frame = local_frame(geometry, position_px)

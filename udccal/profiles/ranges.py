@@ -96,7 +96,7 @@ RANGES: Mapping[type, Mapping[str, Range]] = {
         "depth_ratio": Real(-10.0, 10.0),
         "bar_width": Real(-1.0, 1.0, (2,)),
         "bar_place": Real(-1.0, 1.0, (2,)),
-        "corner": Real(-1.0, 1.0),
+        "corner_radius": Real(-1.0, 1.0),
         "pupil_diameter_mm": Real(1e-3, 1e3),
         "offset_periods": Real(-1e6, 1e6, (2,)),
         "standoff_per_pitch": Real(-1e6, 1e6),

@@ -159,7 +159,7 @@ def _sixth_section(section: Any) -> Any:
 
 def _sixth_to_seventh(found: JsonObject) -> JsonObject:
     """Say that rows are as deep as columns, and openings rectangles that no bar crosses, as it was before."""
-    new = (("depth_ratio", ()), ("bar_width", (2,)), ("bar_place", (2,)), ("corner", ()))
+    new = (("depth_ratio", ()), ("bar_width", (2,)), ("bar_place", (2,)), ("corner_radius", ()))
     return {**_with_zeros(found, "diffraction.depth_mm", new), "version": 7}
 
 

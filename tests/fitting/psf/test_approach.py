@@ -76,5 +76,5 @@ def test_plain_openings_have_neither_bar_nor_corners() -> None:
     assert fit.shape is not None
     names = {one.name for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
     assert not {name for name in names if "bar" in name or "corner" in name}
-    # None was looked for: openings without fit.
+    # Neither was looked for: plain openings fit.
     assert [one.name for one in fit.shape.tried] == ["plain openings (BIC)"]

@@ -53,7 +53,8 @@ def shots(scene: Scene, prior: Prior) -> Shots:
 
 
 @pytest.mark.parametrize(
-    ("interference", "shaped"), [pytest.param(True, False, marks=pytest.mark.slow), (False, False), (False, True)]
+    ("interference", "shaped"),
+    [pytest.param(True, False, marks=pytest.mark.slow), (False, False), (False, True), (True, True)],
 )
 @pytest.mark.medium
 def test_slopes_of_the_kernel_are_those_of_differences(

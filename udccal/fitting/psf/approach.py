@@ -37,8 +37,8 @@ class Approach:
     end: Solution[Place, Blocks]
 
     @property
-    def misfit(self) -> float:
-        """The cost by sample."""
+    def cost_per_sample(self) -> float:
+        """Cost per sample."""
         return self.end.equations.cost / self.problem.used
 
     def attempt(self) -> Attempt[Approach]:
@@ -52,7 +52,7 @@ class Approach:
 
 
 def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
-    """Return the approach with plain openings, or with corners or a bar where they explain the data better (BIC).
+    """Return the approach with plain openings, with round corners, or with a bar in addition: the likeliest by BIC.
 
     Each is looked for where what came before it does not fit.
     """
@@ -60,10 +60,10 @@ def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
     plain = _from_mean(problem, rules)
     attempts, own = [plain.attempt()], plain.end.place.own
     shaped = replace(problem, evaluator=replace(problem.evaluator, shaped=True))
-    if plain.misfit > rules.shaped_from:
+    if plain.cost_per_sample > rules.shaped_from:
         prior = shaped_prior(problem.prior, rules)
         attempts.append(_descended(replace(shaped, prior=prior), prior.mean, own, rules).attempt())
-    if choose(attempts).best.fit.misfit > rules.shaped_from:
+    if choose(attempts).best.fit.cost_per_sample > rules.shaped_from:
         barred = _with_bar(shaped, own, rules)
         if barred.end.place.theta[BAR_WIDTH].max() > rules.least_bar:
             attempts.append(barred.attempt())
@@ -87,7 +87,7 @@ def second_approach(problem: DiffractionProblem, theta: Theta, rules: PsfRules) 
 
 
 def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Approach:
-    """Begin at the prior's mean."""
+    """Return the descent from the prior's mean."""
     mean = problem.prior.mean
 
     def start(one: Samples) -> Own:

@@ -21,6 +21,7 @@ from udccal.fitting.psf.approach import Approach, approach, second_approach, sol
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.kernel import (
     BAR_WIDTH,
+    CORNER,
     FOOTPRINT,
     Evaluator,
     Light,
@@ -46,7 +47,7 @@ class DiffractionFit:
         shots: the data, at the places that the samples are about.
         model_error: as a fraction of the peak, see ``data.left_out``; 0 where the residuals are noise.
         iterations: sum over all descents.
-        shape: comparison by BIC of plain openings to those with round corners or an opaque bar.
+        shape: comparison by BIC of plain openings, round corners, and these with an opaque bar.
         phase: comparison by BIC of a kernel with the wire's phase to one averaged over it; None where no wire was
             seen. The fits are the phase's strength in the kernel (1 where it agrees with the wire, 0 where the kernel
             does not show it) and its sigma.
@@ -71,6 +72,11 @@ class DiffractionFit:
         """0 or 1 where a bar crosses the openings of columns or rows; None where there is none."""
         axes = np.flatnonzero(self.problem.prior.mean[BAR_WIDTH])
         return int(axes[0]) if axes.size else None
+
+    @property
+    def corner_radius(self) -> float | None:
+        """In periods; None where the openings' corners are square."""
+        return max(float(self.theta[CORNER]), 0.0) if self.problem.prior.mean[CORNER] else None
 
     @property
     def converged(self) -> bool:

@@ -227,7 +227,8 @@ def _estimates(
     values[BLUR], known[BLUR] = np.exp([values[BLUR], known[BLUR]])
     unit[BLUR], sigma[BLUR] = values[BLUR], sigma[BLUR] * known[BLUR]
     # Kernels do not tell on which side of the opening's middle a bar is.
-    values[len(_NUMBERS) :] = np.abs(values[len(_NUMBERS) :])
+    values = np.where(np.isin(found, range(BAR_PLACE.start, BAR_PLACE.stop)), np.abs(values), values)
+    values = np.where(np.equal(found, CORNER), fit.corner_radius or 0.0, values)
     # The fit holds the pitch: its tolerance scales all lengths.
     sigma[PITCH] = known[PITCH] * tolerance
     by_pitch = np.where(_LENGTHS[found], values, 0.0) * tolerance
@@ -238,9 +239,9 @@ def _estimates(
 
 
 def _numbers_found(fit: DiffractionFit) -> list[int]:
-    """Return the indices of the numbers that the fit has determined: those of bar and corners only where they are."""
+    """Return the indices of the numbers that the fit has determined; those of bar and corners where there are such."""
     bar = () if fit.bar_axis is None else (BAR_WIDTH.start + fit.bar_axis, BAR_PLACE.start + fit.bar_axis)
-    return [*range(len(_NUMBERS)), *bar, *([CORNER] if fit.problem.prior.mean[CORNER] else [])]
+    return [*range(len(_NUMBERS)), *bar, *([] if fit.corner_radius is None else [CORNER])]
 
 
 def _posterior(
@@ -299,8 +300,8 @@ def _notes(
         if fit.bar_axis is not None:
             of, wide = ("columns", "rows")[fit.bar_axis], fit.theta[BAR_WIDTH][fit.bar_axis]
             notes += [f"A bar {wide:.3f} of a period wide crosses the openings of {of}, such as a wire of the panel."]
-        if fit.problem.prior.mean[CORNER]:
-            notes += [f"The openings' corners are round, with a radius of {fit.theta[CORNER]:.3f} of a period."]
+        if fit.corner_radius is not None:
+            notes += [f"The openings' corners have a radius of {fit.corner_radius:.3f} of a period."]
     notes += [off] if off else []
     if data.doubted:
         notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")

@@ -81,7 +81,8 @@ class Evaluator(eqx.Module):
         wavelengths_nm: nodes of the spectra.
         lattice: of kernels.
         interference: whether the footprint's place on rows is known.
-        shaped: whether openings may have bars and round corners. Without, these have no derivatives, which saves time.
+        shaped: whether openings may have bars and round corners. Without, corners are left out and bars have no
+            derivatives, which saves time.
     """
 
     wavelengths_nm: Float[Arrayish, " nodes"]
@@ -99,7 +100,7 @@ class Evaluator(eqx.Module):
             depth_ratio=theta[DEPTH_RATIO],
             bar_width=theta[BAR_WIDTH],
             bar_place=theta[BAR_PLACE],
-            corner=theta[CORNER],
+            corner_radius=theta[CORNER],
             pupil_diameter_mm=theta[PUPIL],
             blur_px=jnp.exp(theta[BLUR]),
             blur_growth=theta[GROWTH],
@@ -125,7 +126,7 @@ class Evaluator(eqx.Module):
     ) -> Float[Array, "lattice_rows lattice_columns 3"]:
         """Return spline coefficients of the three colours' kernels, for a source whose image is ``disc_px`` wide."""
         model, lattice = self.model(theta), self.lattice
-        transfer = average_transfer(model, frame, lattice, jnp.asarray(model.spectrum), disc_px, self.shaped)
+        transfer = average_transfer(model, frame, lattice, jnp.asarray(model.spectrum), disc_px, rounded=self.shaped)
         if self.interference:
             transfer += interference_transfer(model, frame, lattice, jnp.asarray(model.spectrum), overlaps, disc_px)
         return spline_coefficients(lattice, transfer)
@@ -162,18 +163,20 @@ class Evaluator(eqx.Module):
             x, y = of_orders[0][:, column_of, None, :] * own, strength * of_orders[1][:, row_of]
 
             def light(across: int, down: int) -> Float[Array, "rows half"]:
-                return (rows[down].T @ columns[across]) * average + between(x[across], y[down])
+                alone = (rows[down].T @ columns[across]) * average
+                # Corners are in the average alone.
+                return alone + between(x[across], y[down]) if max(across, down) < len(x) else alone
 
             def between(across: Array, down: Array) -> Float[Array, "rows half"]:
                 return jnp.sum(down[..., None] * across, axis=0)
 
             moved = [between(x[0], by[:, None] * of_orders[1][0, row_of]) for by in by_place.T]
-            shape = [rows[0].T @ by for by in columns[3:]] + [by.T @ columns[0] for by in rows[3:]]
+            shape = [light(*((way, 0) if axis == 0 else (0, way))) for axis in (0, 1) for way in range(3, len(columns))]
             widths = [light(0, 0), light(1, 0), light(0, 1), light(2, 0) + light(0, 2)]
-            return jnp.stack([*widths, (rows[0].T @ columns[0]) * narrower, *moved, *(by * average for by in shape)])
+            return jnp.stack([*widths, (rows[0].T @ columns[0]) * narrower, *moved, *shape])
 
         parts = self._parts(model, slits, fx, fy)
-        orders = self._tables(lambda m, s: slits_of(m, s, fx, fy, HIGHEST_ORDER), model, slits, 2)
+        orders = self._tables(lambda m, s: slits_of(m, s, fx, fy, HIGHEST_ORDER), model, slits, 4 if self.shaped else 2)
         every = jax.lax.map(at_node, (parts, orders, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
         # As one product of matrices: an einsum over the nodes takes five times as long.
         mixed = (spectra @ every.reshape(len(every), -1)).reshape(len(spectra), *every.shape[1:])
@@ -185,7 +188,9 @@ class Evaluator(eqx.Module):
         def factors(head: Float[Array, " head"]) -> Float[Array, "factors 3"]:
             model = self.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
             slits = slits_along(model, frame)
-            shape = jnp.stack([slits.bar_width, slits.bar_place, slits.corner], axis=1).ravel()[: 6 * self.shaped]
+            shape = jnp.stack([slits.bar_width, slits.bar_place, slits.corner_radius], axis=1).ravel()[
+                : 6 * self.shaped
+            ]
             others = head[jnp.array([PITCH, PUPIL])], footprint_place(model, frame)
             common = jnp.concatenate([slits.opened, *others, shape])
             return jnp.concatenate([jnp.tile(common[:, None], (1, 3)), blur_variance(model, frame).T])
@@ -195,9 +200,10 @@ class Evaluator(eqx.Module):
     def _tables(
         self, of_slits: Callable[[Diffraction, Slits], Tables], model: Diffraction, slits: Slits, ways: int
     ) -> Tables:
-        """Return tables of slits by node; after their values, ``ways`` derivatives by open part, pitch, bar and corner.
+        """Return tables of slits by node: their values, and ``ways`` derivatives.
 
-        Columns depend on their own openings, bars and corners alone, as do rows.
+        These are by open part, pitch, bar's width, bar's place and corner's radius, in this order. Columns depend on
+        their own openings, bars and corners alone, as do rows.
         """
 
         def at(slits: Slits, pitch_mm: Float[Array, ""]) -> Tables:
@@ -215,7 +221,9 @@ class Evaluator(eqx.Module):
         ways = 5 if self.shaped else 2
         found = self._tables(lambda m, s: opening_overlaps(m, s, fx, fy, self.shaped), model, slits, ways)
         opened, by = jax.value_and_grad(lambda at: at.open_part(self.shaped))(slits)
-        grown = jnp.stack([jnp.zeros(2), by.opened, jnp.zeros(2), by.bar_width, by.bar_place, by.corner]) / opened
+        grown = (
+            jnp.stack([jnp.zeros(2), by.opened, jnp.zeros(2), by.bar_width, by.bar_place, by.corner_radius]) / opened
+        )
         columns, rows = (part - grown[: ways + 1, axis, None, None] * part[:, :1] for axis, part in enumerate(found))
         return columns, rows / opened
 

@@ -216,7 +216,7 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
         depth_ratio=np.float64(0.0),
         bar_width=np.zeros(2),
         bar_place=np.zeros(2),
-        corner=np.float64(0.0),
+        corner_radius=np.float64(0.0),
         pupil_diameter_mm=footprint * pitch,
         blur_px=np.float64(rules.blur_px),
         blur_growth=np.zeros(2),
@@ -238,7 +238,7 @@ def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
     red, green, blue = np.asarray(model.blur_colour)
     lens = [np.log(model.blur_px) + green, *np.asarray(model.blur_growth), red - green, blue - green]
     head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm, *lens]
-    head += [model.depth_ratio, *np.asarray(model.bar_width), *np.asarray(model.bar_place), model.corner]
+    head += [model.depth_ratio, *np.asarray(model.bar_width), *np.asarray(model.bar_place), model.corner_radius]
     head += [*np.asarray(model.offset_periods), model.standoff_per_pitch]
     return np.concatenate([np.array(head, dtype=float), (logs - logs.mean(axis=1, keepdims=True)).ravel()])
 
