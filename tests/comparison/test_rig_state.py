@@ -82,6 +82,19 @@ def test_a_term_that_contradicts_the_others_is_noticed(
     assert rig_state(off).agreement_p_value < 1e-6
 
 
+def test_openings_that_are_no_rectangles_are_those_of_the_psf(measured: Profile) -> None:
+    psf, sigma = measured.psf, measured.wire.estimate("row_open").sigma
+    radius = replace(psf.estimates[-1], name="corner_radius", value=0.1, sigma=0.01)
+    cov = np.pad(psf.cov, (0, 1))
+    cov[-1, -1] = 1e-4
+    rounded = with_result(measured, "psf", estimates=(*psf.estimates, radius), cov=cov)
+    states = [rig_state(one) for one in (rounded, with_estimates(rounded, "wire", {"row_open": 50 * sigma}))]
+    assert [state.agreement_dof for state in states] == [8 - 3, 8 - 3]
+    assert states[0].agreement_chi2 == pytest.approx(states[1].agreement_chi2)
+    assert number(states[1], "row_open").value == pytest.approx(number(states[0], "row_open").value)
+    assert number(states[0], "row_open").value == pytest.approx(psf.estimate("row_open").value, abs=0.01)
+
+
 def test_the_width_of_backscatters_footprint_says_nothing_of_the_pupil(measured: Profile) -> None:
     before, sigma = rig_state(measured), measured.backscatter.estimate("pupil_diameter_mm").sigma
     after = rig_state(with_estimates(measured, "backscatter", {"pupil_diameter_mm": 20 * sigma}))
