@@ -13,18 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from udccal.models.diffraction import (
     Diffraction,
-    Slits,
     disc_autocorrelation,
     local_frame,
     opening_overlaps,
-    slit_coefficients,
-    window_overlap,
 )
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.models.geometry import Geometry
 from udccal.models.interference import disc_overlap_coefficient
 from udccal.models.lattice import lattice_for, sample, spline_coefficients
 from udccal.models.psf import PsfField, psf_kernels, residual_kernel
+from udccal.models.slits import Slits, slit_coefficients, window_overlap
 from udccal.numerics import in_float64
 from udccal.rig import load_rig
 from udccal.simulation.psf import kernels as simulated_kernels

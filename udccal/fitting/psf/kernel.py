@@ -25,7 +25,6 @@ from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
-    Slits,
     average_transfer,
     blur_variance,
     lattice_frequencies,
@@ -50,6 +49,7 @@ from udccal.models.interference import (
 )
 from udccal.models.lattice import Lattice, lattice_for, sample, spline_coefficients
 from udccal.models.psf import lattice_points
+from udccal.models.slits import Slits
 
 WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 # Nodes of a fit's lattice to a pixel.
