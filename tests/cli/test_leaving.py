@@ -97,6 +97,12 @@ def test_ctrl_c_is_met_wherever_python_is(swallowed: str, tmp_path: Path) -> Non
     assert sentence.startswith("udccal: Stopped.")
 
 
+def test_the_package_itself_is_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "udccal", "rig", "lists"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert "Usage: udccal rig" in done.stderr
+
+
 def test_an_output_of_few_letters_gets_what_it_can_show() -> None:
     words = [*COMMAND, "profile", "show", "lg55-reduced"]
     done = subprocess.run(words, capture_output=True, timeout=280, env={**os.environ, "PYTHONIOENCODING": "latin-1"})

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import pytest
 
 from tests.chromium import Browser, Page, chromium
-from tests.reports.test_page import wide_page
+from tests.reports.test_page import page as report
+from tests.reports.test_page import section, wide_page
 from udccal.reports.page import Advice, DiffPage, DiffSection, Fact, ValidationPage, ValidationSection, render
 from udccal.reports.tables import Table
 
@@ -78,6 +81,38 @@ def test_a_page_can_be_read(browser: Browser, tmp_path: Path, make: object, widt
     page = opened(browser, tmp_path / "page é.html", make(), width, height)
     check_shown(page, height)
     assert "toy" in page.text
+
+
+def test_a_label_stays_on_one_line(browser: Browser, tmp_path: Path) -> None:
+    page = opened(browser, tmp_path / "page.html", wide_page(), 390, 844)
+    lines = "each => (text => (text.selectNodeContents(each), text.getClientRects().length))(document.createRange())"
+    assert page.run(f"[...document.querySelectorAll('dt')].map({lines})") == [1]
+
+
+def test_a_table_of_many_columns_is_not_squeezed_between_others(browser: Browser, tmp_path: Path) -> None:
+    estimates = Table("Fitted", ("quantity", "value", "before", "name"), (("two words", "1", "a ± b", "n" * 50),) * 3)
+    others = tuple(Table(name, ("order", "parameters"), (("rows", "8"),)) for name in ("Accuracy", "Orders"))
+    text = render(report(replace(section(), tables=(estimates, *others))))
+    page = opened(browser, tmp_path / "page.html", text, 1280, 800)
+    inside = "each => each.scrollWidth <= each.clientWidth && each.querySelector('td').getClientRects()[0].height < 40"
+    assert page.run(f"[...document.querySelectorAll('.body .table')].map({inside})") == [True] * 3
+
+
+def test_a_shadow_tells_that_a_table_goes_on(browser: Browser, tmp_path: Path) -> None:
+    page = opened(browser, tmp_path / "page.html", wide_page(), 390, 844)
+    table = "document.querySelector('.table')"
+    page.run(f"{table}.scrollIntoView()")
+
+    def edges() -> list[bool]:
+        left, right, top = page.run(f"(b => [b.left, b.right, b.top])({table}.getBoundingClientRect())")
+        page.screenshot(tmp_path / "shown.png")
+        shown = cv2.imread(str(tmp_path / "shown.png"))
+        assert shown is not None
+        return [bool(shown[int(top) + 3, int(x)].max() < 240) for x in (left + 1, right - 2)]
+
+    assert edges() == [False, True]
+    page.run(f"{table}.scrollLeft = 1e6")
+    assert edges() == [True, False]
 
 
 @pytest.mark.parametrize(
