@@ -59,6 +59,15 @@ def test_the_gain_is_known_as_well_as_foretold(toy: RigDescription, tmp_path: Pa
     assert stated[0] > 1.5 * stated[1]
 
 
+@pytest.mark.medium
+def test_a_quick_fit_of_the_wire_is_foretold_by_its_pixels(toy: RigDescription) -> None:
+    state, size = nominal_state(toy), toy.camera.rows * toy.camera.columns
+    full, quick = WirePredictor(state), WirePredictor(replace(state, wire_pixels=size // 9))
+    assert quick.sigma(toy.captures) == pytest.approx(3 * full.sigma(toy.captures), rel=0.2)
+    assert "more pixels would lower it" in full.limits(toy.captures).lowered_by
+    assert "udccal fit takes more of the sensor's pixels" in quick.limits(toy.captures).lowered_by
+
+
 @pytest.mark.slow
 def test_the_wire_map_is_known_as_well_as_foretold(toy: RigDescription, tmp_path: Path) -> None:
     state, stated = as_it_is(toy), []

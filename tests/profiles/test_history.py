@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from udccal.cli.jobs.log import log_profile
+from udccal.cli.output import Output
 from udccal.errors import ProfileError
 from udccal.profiles.history import history, identity
 from udccal.profiles.profile import Profile
@@ -74,3 +76,9 @@ def test_an_altered_ancestor_is_none(lineage: Path) -> None:
     file = lineage / "second" / PROFILE_NAME
     file.write_text(json.dumps(json.loads(file.read_text())))
     assert len(history(lineage / "third")) == 1
+
+
+def test_the_log_prints_every_note_whole_below_the_table(original: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log_profile(Output(), original / "third")
+    printed = capsys.readouterr().out
+    assert printed.count("\npsf: Fitted with an earlier noise term.\n") == 2

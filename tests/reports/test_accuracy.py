@@ -81,6 +81,11 @@ def test_what_a_fit_wastes_is_the_unused_part() -> None:
     assert _cells(Accuracy(_forecast(), 0.09, 1.0))["unused part of the information"] == "0 %"
 
 
+def test_a_forecast_is_said_to_be_accurate_only_where_that_was_checked() -> None:
+    assert "forecast for the captured frames (within 15 %)" in _cells(Accuracy(_forecast(), None, 1.0))
+    assert "forecast for the captured frames" in _cells(Accuracy(_forecast(), None, 1.0, full=False))
+
+
 def test_what_fits_state_is_in_the_unit_of_the_target() -> None:
     rig = load_rig("lg55-reduced")
     assert stated("noise", _result(), rig) == pytest.approx(0.2)

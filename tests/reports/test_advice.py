@@ -39,7 +39,7 @@ def test_a_good_calibration_is_told_to_be_used_and_until_when(whole: Profile) ->
 
 def test_notes_of_good_terms_are_named(whole: Profile) -> None:
     noted = replace(whole, wire=replace(whole.wire, notes=("A note.",)), psf=replace(whole.psf, notes=("A note.",)))
-    assert "Read the notes of wire and psf" in advice(noted).sentences[-1]
+    assert advice(noted).headline == "All five terms can be used. Read the notes of wire and psf."
 
 
 @pytest.mark.parametrize(
@@ -77,6 +77,13 @@ def test_what_was_not_captured_is_asked_for_by_its_command(whole: Profile) -> No
 
 
 @pytest.mark.parametrize("term", ["wire", "psf", "backscatter"])
+@pytest.mark.parametrize("noise", [FitStatus.CONVERGED, FitStatus.NOT_CONVERGED])
+def test_nobody_is_told_to_restore_what_was_not_measured(whole: Profile, term: str, noise: FitStatus) -> None:
+    found = advice(ended(whole, noise=noise, **{term: FitStatus.NOT_CAPTURED}))
+    assert not any("estore with this profile" in sentence for sentence in found.sentences)
+
+
+@pytest.mark.parametrize("term", ["wire", "psf", "backscatter"])
 def test_a_poor_fit_without_the_lens_asks_for_the_geometry(whole: Profile, term: str) -> None:
     found = advice(ended(whole, geometry=FitStatus.NOT_CAPTURED, **{term: FitStatus.POOR_FIT}))
     assert found.sentences[0].startswith(f"Capture geometry, then fit {term} again")
@@ -85,7 +92,7 @@ def test_a_poor_fit_without_the_lens_asks_for_the_geometry(whole: Profile, term:
 
 
 def test_what_is_to_be_done_comes_before_what_is_good_to_know(whole: Profile) -> None:
-    found = advice(ended(whole, psf=FitStatus.NOT_CONVERGED, wire=FitStatus.NOT_CAPTURED))
+    found = advice(ended(whole, psf=FitStatus.NOT_CONVERGED, geometry=FitStatus.NOT_CAPTURED))
     assert [sentence.split()[0] for sentence in found.sentences] == ["Look", "Capture", "Until"]
 
 

@@ -89,7 +89,7 @@ def test_a_table_shows_dashes_where_nothing_is_known() -> None:
         TruthRow("wire", "map, RMS", "%", None, None, 0.031, None),
     )
     table = truth_table(rows)
-    assert table.rows[0] == ("noise", "gain", "0.34720", "0.34710", "0.0001", "0.0002", "DN/e")
+    assert table.rows[0] == ("noise", "gain", "0.34720", "0.34710", "0.00010", "0.00020", "DN/e")
     assert table.rows[1] == ("wire", "map, RMS", "–", "–", "0.031", "–", "%")
 
 

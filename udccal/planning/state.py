@@ -68,6 +68,7 @@ class RigState:
         noise, geometry: expected terms.
         wire, backscatter: terms that a profile has measured; None stands for the rig as built.
         model_errors: errors in addition to noise.
+        wire_pixels: pixels that the wire's fit uses; None for those of a fit of full effort.
     """
 
     rig: RigDescription
@@ -76,6 +77,7 @@ class RigState:
     wire: Wire | None = None
     backscatter: Backscatter | None = None
     model_errors: ModelErrors = ModelErrors()
+    wire_pixels: int | None = None
 
     def with_captures(self, captures: Captures) -> RigState:
         """The same with other captures."""

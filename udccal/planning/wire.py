@@ -57,7 +57,14 @@ class WirePredictor:
         self._signal_e = state.full_well_e * EvenField(state).signal(places.astype(float))
         # Each sampled pixel represents this many of the sensor's pixels, and of those that the fit uses.
         self._every = size / pixels.used
-        self._spent = self._every / odd_step(size, _RULES.samples)
+        full = size / odd_step(size, _RULES.samples) / pixels.used
+        self._spent = state.wire_pixels / pixels.used if state.wire_pixels else full
+        share = self._spent / self._every
+        self._lowered_by = (
+            "more pixels" if share > 0.9 else f"a fit to more than {100 * share:.0f} % of the sensor's pixels"
+        )
+        if self._spent < 0.9 * full:
+            self._lowered_by = "udccal fit takes more of the sensor's pixels, which"
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over the sensor; see ``Predictor``."""
@@ -67,12 +74,10 @@ class WirePredictor:
         """PRNU and the model error, and sensors of more pixels than the fit uses; see ``Predictor``."""
         noise = self._noise(captures)
         used = min((self._map_sigma(noise, self._every) / self._map_sigma(noise, self._spent)) ** 2, 1.0)
-        fewer = self._spent < 0.9 * self._every
-        more = "a fit to more of the sensor's pixels (FitEffort's wire_samples)" if fewer else "more pixels"
         return Limits(
             self._map_sigma(np.zeros(1), self._spent, self._state.model_errors.wire),
             f"Pixels differ in their response by {100 * self._state.noise.PRNU1288:.2g} % (PRNU), and that does not "
-            f"average over frames: {more} would lower it.",
+            f"average over frames: {self._lowered_by} would lower it.",
             used,
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,11 +28,13 @@ class Accuracy:
 
     Attributes:
         used: fraction of the information in the frames that the fit used, from the fit's diagnostics where it has one.
+        full: whether the fit's effort was full, as in the checks of the forecasts.
     """
 
     forecast: Forecast
     stated: float | None
     used: float
+    full: bool = True
 
     @property
     def sigma(self) -> float:
@@ -47,7 +49,7 @@ class Accuracy:
 
 def accuracies(calibration: Calibration) -> tuple[Accuracy, ...]:
     """Return the accuracy of each fitted term; leave out terms whose procedure does not describe its captures."""
-    state = measured_state(calibration.rig, calibration)
+    state = replace(measured_state(calibration.rig, calibration), wire_pixels=calibration.wire.samples)
 
     def of(term: TermName) -> Accuracy | None:
         result = calibration.result(term)
@@ -58,7 +60,8 @@ def accuracies(calibration: Calibration) -> tuple[Accuracy, ...]:
         if ahead is None:
             return None
         used = _diagnostic(result, "efficiency")
-        return Accuracy(ahead, stated(term, result, calibration.rig), ahead.limits.used if used is None else used)
+        used = ahead.limits.used if used is None else used
+        return Accuracy(ahead, stated(term, result, calibration.rig), used, result.effort == "full")
 
     terms = [term for term in ORDER if calibration.result(term).status is FitStatus.CONVERGED]
     found = in_two_threads(of, terms) if terms else []
@@ -85,7 +88,8 @@ def stated(term: TermName, result: FitResult, rig: RigDescription) -> float | No
 def accuracy_table(accuracy: Accuracy) -> Table:
     """Return the numbers of the figure as a table."""
     ahead, unit = accuracy.forecast, accuracy.forecast.quantity.unit
-    rows = [("forecast for the captured frames (within 15 %)", f"{ahead.sigma:.3g} {unit}")]
+    within = " (within 15 %)" if accuracy.full else ""
+    rows = [(f"forecast for the captured frames{within}", f"{ahead.sigma:.3g} {unit}")]
     if accuracy.stated is not None:
         rows.append(("sigma of the fit", f"{accuracy.stated:.3g} {unit}"))
     rows.append(("floor, however much is captured", f"{ahead.limits.floor:.3g} {unit}" if ahead.limits.floor else "–"))

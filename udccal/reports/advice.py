@@ -17,6 +17,8 @@ _MORE = {
 }
 # Terms whose fits contain the geometry.
 _ON_GEOMETRY = ("wire", "psf", "backscatter")
+# Terms that a restoration takes off the picture.
+_RESTORED = frozenset({"psf", "wire", "backscatter"})
 _IN_THE_MEANTIME = "Until then restore with this profile: its error bars include what is wrong."
 _UNTIL = (
     "Restore with this profile until the lens is refocused or exchanged, the camera or the panel moves, or the panel's "
@@ -27,6 +29,8 @@ _UNTIL = (
 def advice(results: TermResults) -> Advice:
     """Return the headline and at most three sentences: what cannot be used first, then what is doubtful or missing.
 
+    Nobody is told to restore while a term that restoration takes off the picture is missing.
+
     Args:
         results: of a calibration, or of a profile.
     """
@@ -34,15 +38,17 @@ def advice(results: TermResults) -> Advice:
     doubtful = [one.name for one in results.results if one.warning]
     missing = [one.name for one in results.results if one.status is FitStatus.NOT_CAPTURED]
     noted = [one.name for one in results.results if one.notes and one.usable and not one.unfitted]
+    restores = not failed and not _RESTORED.intersection(missing)
     to_do = [_mend(term, results.result(term).status, "geometry" in missing) for term in (*failed, *doubtful)]
     if missing:
         again = " ".join(f"--term {term}" for term in missing)
         to_do.append(f"Capture {_listed(missing)}, where nobody looked yet: udccal calibrate with {again}.")
-    to_know = [] if failed else [_IN_THE_MEANTIME if doubtful else _UNTIL]
-    if noted:
-        to_know.append(f"Read the notes of {_listed(noted)}: they say what the fits held, or left out.")
+    to_know = [_IN_THE_MEANTIME if doubtful else _UNTIL] if restores else []
+    headline = _headline(failed, doubtful, missing)
+    if noted and not failed:
+        headline += f" Read the notes of {_listed(noted)}."
     mood = "bad" if failed else "careful" if doubtful else "absent" if missing else "good"
-    return Advice(_headline(failed, doubtful, missing), mood, _first(to_do, to_know))
+    return Advice(headline, mood, _first(to_do, to_know))
 
 
 def _headline(failed: list[str], doubtful: list[str], missing: list[str]) -> str:

@@ -85,7 +85,7 @@ def truth_table(rows: tuple[TruthRow, ...]) -> Table:
             quantity(row.term, row.quantity).plain,
             "–" if row.fitted is None else number(row.fitted, row.sigma),
             "–" if row.truth is None else number(row.truth, row.sigma),
-            f"{row.error:.2g}",
+            number(row.error, abs(row.error)),
             spread(row.sigma),
             row.unit,
         )

@@ -26,7 +26,7 @@ class ProfileLog:
 
 
 def log_profile(output: Output, path: Path) -> None:
-    """Print a profile's provenance and its terms' statuses, then those of each ancestor beside it.
+    """Print a profile's provenance, its terms' statuses and notes, then those of each ancestor beside it.
 
     Args:
         output: shows the sentences and tables.
@@ -40,6 +40,9 @@ def log_profile(output: Output, path: Path) -> None:
         for sentence in _sentences(profile):
             output.answer(sentence)
         output.table(_terms(profile))
+        for term in profile.terms:
+            for note in term.notes:
+                output.answer(f"{term.term}: {note}")
     if past[-1].parent is not None:
         missing = past[-1].parent[:_DIGITS]
         output.answer(f"The profile {missing} is not beside {path}: what came before is not known here.")
@@ -66,11 +69,8 @@ def _sentences(profile: PastProfile) -> Iterator[str]:
 
 
 def _terms(profile: PastProfile) -> Table:
-    rows = tuple(
-        (t.term, t.status, f"{t.chi2_dof:.3f}", _captured(t), t.effort or "not known", " ".join(t.notes))
-        for t in profile.terms
-    )
-    return Table("Terms", ("term", "status", "reduced χ²", "captured", "effort", "notes"), rows, frozenset({2}))
+    rows = tuple((t.term, t.status, f"{t.chi2_dof:.3f}", _captured(t), t.effort or "not known") for t in profile.terms)
+    return Table("Terms", ("term", "status", "reduced χ²", "captured", "effort"), rows, frozenset({2}))
 
 
 def _captured(term: PastTerm) -> str:

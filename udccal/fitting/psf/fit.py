@@ -42,6 +42,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
+from udccal.quantities import quantity
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 from udccal.rig import RigDescription
 
@@ -291,9 +292,9 @@ def _notes(
     image = "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is known."
     notes = [image, "chi2_dof is of that image at positions held out, and allows for their model error."]
     if fit is not None:
-        named = (_NAMES[number] for number in _numbers_found(fit))
-        refuted = f"{', '.join(named)} are numbers of a model that they refute. {off}".rstrip()
-        pattern = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {refuted}"
+        named = "; ".join(quantity("psf", _NAMES[number]).plain for number in _numbers_found(fit))
+        refuted = f"which refutes the model behind these numbers: {named}. {off}".rstrip()
+        pattern = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}), {refuted}"
         off = pattern if pattern_p <= SIGNIFICANT else ""
         notes = ["cov leaves out spectra and field coefficients of the residual."]
         notes += ["chi2_dof is of the fit of diffraction and allows for the model error of its residuals."]
