@@ -16,11 +16,12 @@ from udccal.cli.output import plain
 from udccal.comparison.comparable import check_comparable
 from udccal.comparison.effects import Effect
 from udccal.comparison.limits import DiffLimits
+from udccal.comparison.maps import difference_maps
 from udccal.comparison.term_diff import VERDICTS, verdict_of
 from udccal.errors import ProfileError
 from udccal.fitting.wire.fit import sensor_map
 from udccal.profiles.profile import Profile, build_profile
-from udccal.reports.diff_tables import movement_sentence
+from udccal.reports.diff_tables import movement_sentence, notes
 from udccal.result import Captures, FitStatus
 from udccal.sessions.schema import TermName
 
@@ -110,6 +111,23 @@ def test_a_profile_and_itself_are_the_same(toy: Profile) -> None:
 
 
 @pytest.mark.medium
+@pytest.mark.medium
+def test_what_two_profiles_share_is_computed_once(toy: Profile) -> None:
+    maps = difference_maps(toy, toy)
+    assert maps.kernels_a is maps.kernels_b
+    assert maps.light_a is maps.light_b
+    brighter = replace(toy.backscatter.term, mask=2 * np.asarray(toy.backscatter.term.mask))
+    other = difference_maps(toy, replace(toy, backscatter=replace(toy.backscatter, term=brighter)))
+    assert other.kernels_a is other.kernels_b
+    np.testing.assert_allclose(other.light_b, 2 * other.light_a)
+
+
+@pytest.mark.medium
+def test_what_chi_squared_leaves_out_is_listed_by_names_that_hold_commas(toy: Profile) -> None:
+    term = replace(udccal.diff(toy, toy).terms[1], not_covered=("fx", "fy"))
+    assert notes(term)[-1].endswith("no covariance is kept of it: focal length, x; focal length, y.")
+
+
 @pytest.mark.parametrize("lacks", [("wire",), ("wire", "psf"), get_args(TermName)], ids=str)
 def test_a_term_that_nobody_captured_is_not_compared(toy: Profile, lacks: tuple[TermName, ...]) -> None:
     lacking = {term: replace(toy.result(term), status=FitStatus.NOT_CAPTURED) for term in lacks}

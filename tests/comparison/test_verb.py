@@ -35,6 +35,8 @@ def test_the_same_profile_twice_has_status_0(folder: Path) -> None:
     done = diff(folder / "a", folder / "a")
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("Go on with either profile: they agree within their error bars.\n")
+    (said,) = (line for line in done.stderr.splitlines() if "no number of this term" in line)
+    assert said.startswith("wire, psf, backscatter: ")
 
 
 def test_a_change_has_status_3_and_is_written(folder: Path) -> None:

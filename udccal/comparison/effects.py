@@ -13,6 +13,7 @@ from udccal.comparison.limits import DiffLimits
 from udccal.comparison.maps import DifferenceMaps
 from udccal.comparison.picture import PictureLoss
 from udccal.profiles.profile import Profile
+from udccal.quantities import quantity
 from udccal.result import FitResult
 from udccal.sessions.schema import TermName
 
@@ -68,15 +69,15 @@ def effects_of(
 
 def _noise(a: Profile, b: Profile, limits: DiffLimits) -> tuple[Effect, ...]:
     shares = (
-        ("K", "K_DN_per_e", limits.K_percent),
-        ("σ_d", "sigma_d_e", limits.sigma_d_percent),
-        ("PRNU", "PRNU1288", limits.PRNU_percent),
+        ("K_DN_per_e", limits.K_percent),
+        ("sigma_d_e", limits.sigma_d_percent),
+        ("PRNU1288", limits.PRNU_percent),
     )
     found = []
-    for name, field, limit in shares:
-        one, other = (float(np.asarray(getattr(p.noise.term, field))) for p in (a, b))
+    for name, limit in shares:
+        one, other = (float(np.asarray(getattr(p.noise.term, name))) for p in (a, b))
         middle = abs(one + other) / 2 or 1.0
-        found.append(Effect(name, 100 * abs(other - one) / middle, "%", limit))
+        found.append(Effect(quantity("noise", name).plain, 100 * abs(other - one) / middle, "%", limit))
     one, other = a.noise.term, b.noise.term
     dark_DN = float(one.K_DN_per_e * one.sigma_d_e + other.K_DN_per_e * other.sigma_d_e) / 2 or 1.0
     off = abs(float(other.black_DN - one.black_DN)) / dark_DN

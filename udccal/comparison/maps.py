@@ -62,8 +62,10 @@ def difference_maps(a: Profile, b: Profile) -> DifferenceMaps:
         ProfileError: when the terms give numbers that are not finite.
     """
     rays, lens, sigma = _rays(a, b)
-    kernels_a, kernels_b = _kernels(a, b)
+    same_rig = a.rig == b.rig
+    kernels_a, kernels_b = _kernels(a, b, same_rig and _alike(a.psf.term, b.psf.term))
     pictures = panel_pictures(a.rig)
+    light_a = _light(a, pictures)
     with np.errstate(divide="ignore", invalid="ignore"):
         wire = np.log(b.wire_map.astype(np.float64) / a.wire_map)
     maps = DifferenceMaps(
@@ -73,8 +75,8 @@ def difference_maps(a: Profile, b: Profile) -> DifferenceMaps:
         wire=wire,
         kernels_a=kernels_a,
         kernels_b=kernels_b,
-        light_a=_light(a, pictures),
-        light_b=_light(b, pictures),
+        light_a=light_a,
+        light_b=light_a if same_rig and _alike(a.backscatter.term, b.backscatter.term) else _light(b, pictures),
     )
     check_finite(maps.wire, maps.kernels_a, maps.kernels_b, maps.light_a, maps.light_b)
     return maps
@@ -151,15 +153,23 @@ def _numpy(term: Geometry) -> Geometry:
     return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), term)
 
 
-def _kernels(a: Profile, b: Profile) -> tuple[Float[np.ndarray, "places 3 ky kx"], Float[np.ndarray, "places 3 ky kx"]]:
+def _alike(a: object, b: object) -> bool:
+    """Whether two terms hold the same finite numbers, so that what follows from them need not be computed twice."""
+    (one, of), (other, as_well) = jax.tree.flatten(a), jax.tree.flatten(b)
+    return of == as_well and all(map(np.array_equal, one, other))
+
+
+def _kernels(
+    a: Profile, b: Profile, same: bool
+) -> tuple[Float[np.ndarray, "places 3 ky kx"], Float[np.ndarray, "places 3 ky kx"]]:
     """Kernels of both at their fitted sizes, for which they are compiled since the fit, in frames of one size."""
     places, sizes = kernel_places(a.rig), [fitted_size(p.psf.term, p.rig) for p in (a, b)]
     rows, columns = np.max(sizes, axis=0)
     framed = []
-    for profile, (down, across) in zip((a, b), sizes, strict=True):
+    for profile, (down, across) in zip((a,) if same else (a, b), sizes, strict=False):
         margin = [(0, 0), (0, 0), *(((whole - part) // 2,) * 2 for whole, part in ((rows, down), (columns, across)))]
         framed.append(np.pad(kernels_at(profile.psf.term, places, down, across).astype(np.float64), margin))
-    return framed[0], framed[1]
+    return framed[0], framed[-1]
 
 
 def panel_pictures(rig: RigDescription) -> UInt8[np.ndarray, "2 panel_rows panel_columns 3"]:

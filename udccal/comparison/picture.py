@@ -9,6 +9,7 @@ is left out: it moves the picture.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import final
 
 import numpy as np
@@ -25,6 +26,7 @@ from udccal.restoration.metrics import encode_srgb
 _TILE, _MEAN, _SPREAD, _DARKEST, _POWER = 320, 0.35, 0.2, 0.02, -3.0
 # Part of the sensor's range that the scene's white fills; the panel's light is as bright at its peak.
 _WHITE = 0.4
+_TERMS = ("wire", "psf", "backscatter")
 
 
 @final
@@ -78,6 +80,10 @@ def picture_loss(a: Profile, b: Profile, maps: DifferenceMaps) -> PictureLoss:
     peak = max(float(np.abs(light).max()) for light in (maps.light_a, maps.light_b)) or 1.0
     seen_a = _seen(a, maps.kernels_a, maps.light_a[-1] / peak)
     seen_b = _seen(b, maps.kernels_b, maps.light_b[-1] / peak)
+    pairs = list(zip(seen_a, seen_b, strict=True))
+    changed = {t for t in _TERMS if not all(np.array_equal(getattr(one, t), getattr(other, t)) for one, other in pairs)}
+    if not changed:
+        return PictureLoss(0.0, 0.0, 0.0, 0.0)
     scene = _scene(a, b)
     ways = [
         [(scene.frame(one), one, other) for one, other in zip(*seen, strict=True)]
@@ -85,14 +91,19 @@ def picture_loss(a: Profile, b: Profile, maps: DifferenceMaps) -> PictureLoss:
     ]
     own = [float(sum(scene.error(frame, one) for frame, one, _ in way)) for way in ways]
 
-    def loss(*terms: str) -> float:
+    @cache
+    def loss_of(terms: frozenset[str]) -> float:
         mixed = [
             sum(scene.error(frame, replace(one, **{t: getattr(other, t) for t in terms})) for frame, one, other in way)
             for way in ways
         ]
         return max(10 * float(np.log10(max(m, 1e-12) / max(o, 1e-12))) for m, o in zip(mixed, own, strict=True))
 
-    return PictureLoss(loss("wire"), loss("psf"), loss("backscatter"), loss("wire", "psf", "backscatter"))
+    def loss(*terms: str) -> float:
+        # Terms that are the same lose nothing.
+        return loss_of(frozenset(terms) & changed) if changed.intersection(terms) else 0.0
+
+    return PictureLoss(loss("wire"), loss("psf"), loss("backscatter"), loss(*_TERMS))
 
 
 def _scene(a: Profile, b: Profile) -> _Scene:

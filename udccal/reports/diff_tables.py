@@ -98,7 +98,7 @@ def finding(one: TermDiff) -> str:
 
 def notes(one: TermDiff) -> tuple[str, ...]:
     """Return what a person should know of a term, with what chi-squared leaves out."""
-    names = ", ".join(quantity(one.term, name).plain for name in one.not_covered)
+    names = "; ".join(quantity(one.term, name).plain for name in one.not_covered)
     left = (f"Not in χ², as no covariance is kept of it: {names}.",) if names else ()
     return (*one.notes, *left)
 

@@ -13,7 +13,6 @@ from udccal.compilation import keep_compilations
 from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.profiles.store import load_profile
-from udccal.reports.diff_page import diff_page
 from udccal.reports.diff_tables import movement_sentence, movement_table, notes, terms_table
 from udccal.reports.page import write_page
 
@@ -41,9 +40,12 @@ def diff_profiles(output: Output, a: Path, b: Path, out: Path | None) -> bool:
     output.table(movement_table(found.movement))
     output.answer(movement_sentence(found))
     output.answer(f"Restoring frames of the one with the other loses {found.picture_dB_lost:.2f} dB.")
+    of_note: dict[str, list[str]] = {}
     for term in found.terms:
         for note in notes(term):
-            output.say(f"{term.term}: {note}")
+            of_note.setdefault(note, []).append(term.term)
+    for note, terms in of_note.items():
+        output.say(f"{', '.join(terms)}: {note}")
     if out is not None:
         _write(output, out, found, maps)
     output.result(found)
@@ -51,6 +53,8 @@ def diff_profiles(output: Output, a: Path, b: Path, out: Path | None) -> bool:
 
 
 def _write(output: Output, out: Path, found: ProfileDiff, maps: DifferenceMaps) -> None:
+    from udccal.reports.diff_page import diff_page  # it draws, which takes a second to load
+
     with output.stage("report"), storing_in(out):
         write_page(out / "diff.html", diff_page(found, maps))
         write_atomically(out / "diff.json", json.dumps(plain(found), indent=2, allow_nan=False).encode() + b"\n")
