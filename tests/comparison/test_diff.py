@@ -111,7 +111,6 @@ def test_a_profile_and_itself_are_the_same(toy: Profile) -> None:
 
 
 @pytest.mark.medium
-@pytest.mark.medium
 def test_what_two_profiles_share_is_computed_once(toy: Profile) -> None:
     maps = difference_maps(toy, toy)
     assert maps.kernels_a is maps.kernels_b
@@ -128,6 +127,7 @@ def test_what_chi_squared_leaves_out_is_listed_by_names_that_hold_commas(toy: Pr
     assert notes(term)[-1].endswith("no covariance is kept of it: focal length, x; focal length, y.")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("lacks", [("wire",), ("wire", "psf"), get_args(TermName)], ids=str)
 def test_a_term_that_nobody_captured_is_not_compared(toy: Profile, lacks: tuple[TermName, ...]) -> None:
     lacking = {term: replace(toy.result(term), status=FitStatus.NOT_CAPTURED) for term in lacks}

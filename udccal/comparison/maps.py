@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,8 +63,10 @@ def difference_maps(a: Profile, b: Profile) -> DifferenceMaps:
         ProfileError: when the terms give numbers that are not finite.
     """
     rays, lens, sigma = _rays(a, b)
+    # What follows from the same finite numbers is computed once.
     same_rig = a.rig == b.rig
-    kernels_a, kernels_b = _kernels(a, b, same_rig and _alike(a.psf.term, b.psf.term))
+    same_light = same_rig and bool(eqx.tree_equal(a.backscatter.term, b.backscatter.term))
+    kernels_a, kernels_b = _kernels(a, b, same_rig and bool(eqx.tree_equal(a.psf.term, b.psf.term)))
     pictures = panel_pictures(a.rig)
     light_a = _light(a, pictures)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -76,7 +79,7 @@ def difference_maps(a: Profile, b: Profile) -> DifferenceMaps:
         kernels_a=kernels_a,
         kernels_b=kernels_b,
         light_a=light_a,
-        light_b=light_a if same_rig and _alike(a.backscatter.term, b.backscatter.term) else _light(b, pictures),
+        light_b=light_a if same_light else _light(b, pictures),
     )
     check_finite(maps.wire, maps.kernels_a, maps.kernels_b, maps.light_a, maps.light_b)
     return maps
@@ -151,12 +154,6 @@ def _slopes(
 def _numpy(term: Geometry) -> Geometry:
     """The same numbers as float64, so that one compilation serves a fitted term and one that was read."""
     return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), term)
-
-
-def _alike(a: object, b: object) -> bool:
-    """Whether two terms hold the same finite numbers, so that what follows from them need not be computed twice."""
-    (one, of), (other, as_well) = jax.tree.flatten(a), jax.tree.flatten(b)
-    return of == as_well and all(map(np.array_equal, one, other))
 
 
 def _kernels(
