@@ -14,6 +14,7 @@ import pytest
 from tests.profiles.test_versions import written_in_version_2
 from udccal.errors import ProfileError
 from udccal.profiles.copies import migrate_profile, pack_profile, unpack_profile
+from udccal.profiles.exchange.exports import EXPORTS, export_profile
 from udccal.profiles.history import identity
 from udccal.profiles.profile import Profile
 from udccal.profiles.provenance import PROFILE_NAME
@@ -46,6 +47,18 @@ def test_packed_and_unpacked_it_is_the_same_to_the_byte(folder: Path) -> None:
     assert contents(unpacked) == contents(folder)
     pack_profile(packed, folder.with_name("again.zip"))
     assert sorted(item.name for item in folder.parent.iterdir()) == ["again.zip", "p", "p.zip", "q"]
+
+
+def test_nothing_is_written_into_a_profile(folder: Path, toy_profile: Profile) -> None:
+    """Its folder would hold more than its files then, and could not be replaced."""
+    before = contents(folder)
+    for target in (folder / "z.zip", folder / "deep" / "z.zip", folder / ".." / "p" / "z.zip"):
+        with pytest.raises(ProfileError, match="outside of any profile"):
+            pack_profile(folder, target)
+    with pytest.raises(ProfileError, match="outside of any profile"):
+        export_profile(toy_profile, EXPORTS["npz"], folder / "deep" / "x.npz")
+    assert contents(folder) == before
+    pack_profile(folder, folder / ".." / "z.zip")
 
 
 def damaged_zip(packed: Path, name: str) -> Path:

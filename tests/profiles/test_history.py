@@ -26,7 +26,7 @@ def original(tmp_path_factory: pytest.TempPathFactory, toy_profile: Profile) -> 
     tmp_path = tmp_path_factory.mktemp("lineage")
     write_profile(tmp_path / "first.zip", dataclasses.replace(toy_profile, parent=MISSING))
     noted = dataclasses.replace(toy_profile.psf, notes=("Fitted with an earlier noise term.",))
-    other = dataclasses.replace(toy_profile.noise.term, K_DN_per_e=0.356)
+    other = dataclasses.replace(toy_profile.noise.term, sigma_d_e=4.8)
     second = dataclasses.replace(
         toy_profile,
         parent=identity(tmp_path / "first.zip").sha256,

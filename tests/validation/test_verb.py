@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import udccal
-from tests.comparison.perturbed import with_result
+from tests.comparison.perturbed import with_estimates, with_result
 from tests.reports.widths import layouts
 from tests.toy_rigs import write_toy_rig
 from udccal.benches.bench import simulated_bench
@@ -42,8 +42,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if day == "first":
             udccal.calibrate(session).write(folder / "profile")
     profile = load_profile(folder / "profile")
+    K = float(profile.noise.term.K_DN_per_e)
     more = replace(profile.noise.term, K_DN_per_e=1.1 * profile.noise.term.K_DN_per_e)
-    write_profile(folder / "wrong", with_result(profile, "noise", term=more))
+    wrong = with_estimates(with_result(profile, "noise", term=more), "noise", {"K_DN_per_e": 0.1 * K})
+    write_profile(folder / "wrong", wrong)
     return folder
 
 

@@ -19,6 +19,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
+from udccal.profiles.agreement import check_agreement
 from udccal.profiles.arrays import read_checked
 from udccal.profiles.evidence import load_fit, store_fit
 from udccal.profiles.packing import Packed, pack, unpack
@@ -40,11 +41,12 @@ def encode(profile: Profile, folder: Path) -> StoredProfile:
     """Write a profile's arrays to ``folder`` and return the content of ``profile.json``.
 
     Raises:
-        ProfileError: when a number is not finite or out of range, so that the profile could not be read again.
+        ProfileError: when a number is not finite, out of range or not its fit's: such a profile could not be read.
     """
     shared = profile.geometry.term
     for result in profile.results:
         check_term(result.term, result.name, profile.rig)
+        check_agreement(result)
     return StoredProfile(
         format=FORMAT,
         version=VERSION,
@@ -116,7 +118,9 @@ def _load_section(
         raise ProfileError(f"Expected the model {kind.__name__}, found '{section.model}'. Update udccal to read it.")
     term = unpack(Packed(section.parameters, section.arrays), kind, folder, geometry)
     check_term(term, name, stored.rig)
-    return load_fit(name, section.fit, term, folder)
+    result = load_fit(name, section.fit, term, folder)
+    check_agreement(result)
+    return result
 
 
 def _with_sigma(result: FitResult, pictures: Mapping[str, StoredPicture], folder: Path) -> FitResult:

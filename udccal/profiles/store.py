@@ -189,7 +189,8 @@ def check_replaceable(path: Path) -> None:
     """Refuse a ``path`` that ``write_profile`` would refuse; call it before the work that leads to a profile.
 
     Raises:
-        ProfileError: when ``path`` holds something other than a profile, or has no name by which it can be replaced.
+        ProfileError: when ``path`` holds something other than a profile, has no name by which it can be replaced, or
+            lies inside a profile.
         FileFormatError: when it has bytes that are not UTF-8.
     """
     if path.name in ("", ".."):
@@ -198,6 +199,7 @@ def check_replaceable(path: Path) -> None:
             "profile a name."
         )
     check_path(path.absolute())
+    check_outside_profiles(path)
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     try:
@@ -216,6 +218,20 @@ def check_replaceable(path: Path) -> None:
         raise ProfileError(
             f"Expected {path} to hold only a profile's files, found '{others[0]}' too. Move it, or choose another path."
         )
+
+
+def check_outside_profiles(path: Path) -> None:
+    """Refuse a ``path`` inside a profile's folder, which then could not be replaced any more.
+
+    Raises:
+        ProfileError: which names that profile.
+    """
+    for folder in Path(os.path.abspath(path)).parents:
+        if os.path.lexists(folder / PROFILE_NAME):
+            raise ProfileError(
+                f"Expected a place outside of any profile, found {path} inside the profile {folder}, which holds its "
+                "own files only. Choose another path."
+            )
 
 
 def stored_files(stored: StoredProfile) -> set[str]:

@@ -64,6 +64,11 @@ def write(profile: Profile, path: Path) -> Path:
     return path
 
 
+def test_a_file_says_that_its_pose_is_not_read_back(tmp_path: Path, profile: Profile) -> None:
+    assert any("does not read the pose back" in sentence for sentence in EXPORTS["mrcal"].not_held)
+    assert read_lens(write(profile, tmp_path / "a.cameramodel"), IMPORTS["mrcal"]).pose is None
+
+
 def panel_points_m() -> np.ndarray:
     """Points up to two metres before the panel, in its frame."""
     x, y = np.meshgrid(np.linspace(0.2, 1.0, 5), np.linspace(-0.5, 0.6, 5))

@@ -52,7 +52,6 @@ def export(output: Output, path: Path, to: str, out: Path) -> None:
     """
     profile, into = load_profile(path), EXPORTS[to]
     with storing_in(out.parent):
-        out.parent.mkdir(parents=True, exist_ok=True)
         export_profile(profile, into, out)
     beside = covariance_file(out)
     output.say(f"{path} -> {out}, its covariance {beside}")

@@ -17,6 +17,7 @@ from udccal.io.atomic import write_atomically
 from udccal.profiles.exchange import estimates_csv, mrcal, npz, opencv_yaml, ros_camera_info
 from udccal.profiles.exchange.format import ExportFormat
 from udccal.profiles.profile import Profile
+from udccal.profiles.store import check_outside_profiles
 from udccal.result import Estimate
 
 FORMAT, VERSION = "udccal-covariance", 1
@@ -65,14 +66,16 @@ def export_profile(profile: Profile, to: ExportFormat, path: Path) -> None:
         path: the new file; ``covariance_file(path)`` is written, too.
 
     Raises:
-        ProfileError: when one of the two is there already; nothing is written then.
+        ProfileError: when one of the two is there already, or would be inside a profile; nothing is written then.
         OSError: when one cannot be written; the other is not left behind.
     """
     beside = covariance_file(path)
+    check_outside_profiles(path)
     for file in (path, beside):
         if os.path.lexists(file):
             raise ProfileError(f"Expected a new file, found that {file} exists. Remove it, or choose another name.")
     content, known = to.encode(profile), dataclasses.asdict(_covariances(profile, to))
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(beside, json.dumps(known, indent=1, allow_nan=False).encode("utf-8") + b"\n")
     try:
         write_atomically(path, content)

@@ -118,6 +118,7 @@ EXPORT = ExportFormat(
     not_held=(
         "mrcal's model holds the lens and the camera's pose in the panel's frame. It cannot hold noise, wire, psf and "
         "backscatter.",
+        "`udccal profile import` does not read the pose back: other programs' models have other reference frames.",
         "It has no optimization inputs, so that mrcal refuses to tell its uncertainty: that is in the .json beside it.",
     ),
     encode=_encode,
