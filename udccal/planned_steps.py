@@ -20,6 +20,15 @@ def with_small_panel(rig: RigDescription) -> RigDescription:
     return rig.model_copy(update={"panel": panel})
 
 
+def planned_ids(term: TermName, rig: RigDescription) -> list[str]:
+    """Return the ids of the steps that a term's procedure plans for a rig, in the order of their capture.
+
+    Raises:
+        UdccalError: when no procedure of the term is installed.
+    """
+    return [step.id for step in find_procedure(term)().steps(with_small_panel(rig))]
+
+
 def skipped_note(term: TermName, rig: RigDescription, captured: Set[str]) -> str:
     """Return a sentence that counts the planned steps of a term and names the skipped ones; empty where none is.
 
@@ -29,7 +38,7 @@ def skipped_note(term: TermName, rig: RigDescription, captured: Set[str]) -> str
         captured: ids of the steps that a session has.
     """
     try:
-        planned = [step.id for step in find_procedure(term)().steps(with_small_panel(rig))]
+        planned = planned_ids(term, rig)
     except UdccalError:
         return ""
     skipped = [step_id for step_id in planned if step_id not in captured]
