@@ -40,6 +40,7 @@ def checked(profile: Profile, names: tuple[str, ...]) -> tuple[RigCheck, Solved]
     values = np.array([TURNED_RAD, 0.0, 0.0, np.log1p(-z / float(wire.standoff_per_pitch)), x, y, 0.0])
     values[:3] *= "tilted" in names
     values[3:6] *= "moved" in names
+    values[6] = 0.01 * ("refocused" in names)
     cov = np.diag(np.full(7, 1e-6))
     pose = PoseChange(values, cov, wire, np.zeros((24, 32)), np.ones((24, 32)), 1.0)
     changes = tuple(Change(name, 1.0, 0.1, 0.5, "1", True, "It changed.", "Mend it.") for name in names)
@@ -112,12 +113,70 @@ def test_a_profile_without_a_pose_of_its_geometry_is_updated_too(profile: Profil
 
 def test_the_place_keeps_the_checks_correlations(profile: Profile, session: Path) -> None:
     found, solved = checked(profile, ("moved",))
-    cov = solved.pose.cov.copy()
+    cov = solved.cause.cov.copy()
     cov[3, 4] = cov[4, 3] = 0.8e-6
-    solved = replace(solved, pose=replace(solved.pose, cov=cov))
+    # With all seven numbers free, that of a place is larger: focus and turn look alike.
+    solved = replace(solved, cause=replace(solved.cause, cov=cov), pose=replace(solved.pose, cov=300 * cov))
     wire = updated(profile, Path("lg55-reduced"), found, solved, session).wire
     i, j = ([one.name for one in wire.estimates].index(name) for name in ("standoff_per_pitch", "offset_x_periods"))
     sigma = np.sqrt(np.diag(wire.cov))
+    assert sigma[j] == pytest.approx(1e-3)
     assert wire.cov[i, j] / sigma[i] / sigma[j] == pytest.approx(0.8)
     assert (wire.estimates[i].sigma, wire.estimates[j].sigma) == pytest.approx((sigma[i], sigma[j]))
     assert np.linalg.eigvalsh(wire.cov / np.outer(sigma, sigma)).min() > -1e-9
+
+
+def test_a_new_focal_length_has_the_errors_of_both(profile: Profile, session: Path) -> None:
+    new = updated(profile, Path("lg55-reduced"), *checked(profile, ("refocused",)), session).geometry
+    old = profile.geometry
+    names = [one.name for one in old.estimates]
+    for axis, name in enumerate(("fx", "fy")):
+        i, before, after = names.index(name), old.estimate(name), new.estimate(name)
+        assert after.value == pytest.approx(before.value * np.exp(0.01))
+        assert after.value == pytest.approx(float(new.term.focal_px[axis]))
+        assert after.sigma == pytest.approx(np.hypot(before.sigma, 1e-3 * after.value))
+        assert new.cov[i, i] == pytest.approx(after.sigma**2)
+    i, j, k = (names.index(name) for name in ("fx", "fy", "k1"))
+    assert new.cov[i, j] / np.sqrt(new.cov[i, i] * new.cov[j, j]) > 0.99
+    assert new.cov[i, k] == old.cov[i, k]
+
+
+def test_the_light_has_the_error_of_the_movement_too(profile: Profile, session: Path) -> None:
+    new = updated(profile, Path("lg55-reduced"), *checked(profile, ("moved",)), session).backscatter
+    before, after = profile.backscatter.estimate("offset_x_px"), new.estimate("offset_x_px")
+    assert after.value == pytest.approx(before.value - MOVED_MM[0] / profile.rig.panel.pitch_mm.value)
+    assert after.sigma == pytest.approx(np.hypot(before.sigma, 1e-3))
+
+
+@pytest.mark.parametrize(
+    ("causes", "noted"),
+    [
+        (("panel level",), {"backscatter": "(panel level 90.0, 90.0, 90.0 %): its numbers are older."}),
+        (("gain",), {"noise": "(gain): it found K_DN_per_e, the other numbers are older."}),
+        (
+            ("moved",),
+            {
+                "wire": "(moved): it found standoff_per_pitch, offset_x_periods, offset_y_periods, the other",
+                "psf": "(moved): its numbers are older.",
+                "backscatter": "(moved): it found standoff_mm, offset_x_px, offset_y_px, the other",
+            },
+        ),
+        (
+            ("refocused",),
+            {
+                "geometry": "(refocused): it found fx, fy, the other",
+                "wire": "(refocused): its numbers are older.",
+                "psf": "(refocused): its numbers are older. After a change of focus, the psf needs a calibration.",
+                "backscatter": "(refocused): its numbers are older.",
+            },
+        ),
+    ],
+)
+def test_every_term_that_changed_says_so(
+    profile: Profile, session: Path, causes: tuple[str, ...], noted: dict[str, str]
+) -> None:
+    new = updated(profile, Path("lg55-reduced"), *checked(profile, causes), session)
+    told = {one.name: one.notes[len(profile.result(one.name).notes) :] for one in new.results}
+    assert {name for name, notes in told.items() if notes} == set(noted)
+    for name, words in noted.items():
+        assert f"Changed by a check of a few minutes {words}" in told[name][0]
