@@ -15,10 +15,11 @@ from tests.guide.scripted import Scripted
 from udccal.arrangements import Dark, PanelPicture
 from udccal.cli.bench_options import BenchOptions, CameraKind, DisplayKind
 from udccal.cli.jobs.capture import Wanted
+from udccal.cli.jobs.guided import show_on_panel
 from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output
 from udccal.errors import UdccalError
-from udccal.guide.events import Answer, Event, Person, VerdictEvent
+from udccal.guide.events import Answer, Event, Person, RequestEvent
 from udccal.sessions.store import Session
 
 LIT = PanelPicture(np.full((36, 64, 3), 255, np.uint8))
@@ -44,7 +45,7 @@ def test_whoever_agrees_is_asked_for_each_picture(
     asked: list[str] = []
 
     def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
-        if not isinstance(event, VerdictEvent) or event.step_id != "panel":
+        if not isinstance(event, RequestEvent):
             return None
         asked.append(event.sentence)
         painted.put = Dark() if event.sentence.startswith("Switch the panel off") else LIT
@@ -55,7 +56,24 @@ def test_whoever_agrees_is_asked_for_each_picture(
     assert [sentence.split()[0] for sentence in asked] == ["Show", "Switch", "Show", "Show"]
     assert person.prompts == len(asked)
     told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [event["sentence"] for event in told if event.get("step_id") == "panel"] == asked
+    assert [event["sentence"] for event in told if event["event"] == "request"] == asked
+
+
+def test_whoever_quits_when_asked_for_a_picture_stops_the_capture(tmp_path: Path, painted: PaintedRig) -> None:
+    """It was a step to try again, so that nobody could leave."""
+    person = Scripted(lambda event, offered: Answer.quit if isinstance(event, RequestEvent) else None)
+    assert not agreed(painted, tmp_path / "s", person)
+    assert person.done.stopped
+    assert sum(isinstance(event, RequestEvent) for event in person.events) == 1
+
+
+def test_a_picture_to_show_is_no_verdict(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))
+    assert show_on_panel(TerminalPerson(Output()), "Show a.png on the panel.")
+    said = capsys.readouterr().err
+    assert "Show a.png on the panel. Go on when it is done." in said
+    assert "[Enter · quit]" in said
+    assert "✓" not in said
 
 
 def test_without_anybody_to_ask_nothing_is_captured(

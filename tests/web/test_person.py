@@ -19,6 +19,7 @@ from udccal.guide.events import (
     Person,
     ProgressEvent,
     ReadingsEvent,
+    RequestEvent,
     StepEvent,
     VerdictEvent,
 )
@@ -106,6 +107,18 @@ def test_a_step_clears_what_the_last_one_showed(person: WebPerson) -> None:
     person.tell(STEP)
     shown = person.news(MINE, 0, 0, 0.0).shown
     assert (shown.step, shown.readings, shown.progress, shown.verdict) == (STEP, None, None, None)
+
+
+def test_a_request_is_shown_until_it_is_answered(person: WebPerson) -> None:
+    person.tell(STEP)
+    person.tell(ReadingsEvent(STEP.id, (), "Move it."))
+    request = RequestEvent("Show a.png.", (Answer.go, Answer.quit))
+    person.tell(request)
+    shown = person.news(MINE, 0, 0, 0.0).shown
+    assert (shown.request, shown.readings, shown.verdict) == (request, None, None)
+    person.give(MINE, asked(person, request.offered), Answer.go)
+    assert person.answer(request.offered, 0.0) is Answer.go
+    assert person.news(MINE, 0, 0, 0.0).shown.request is None
 
 
 def test_news_come_when_something_happens_and_not_before(person: WebPerson) -> None:

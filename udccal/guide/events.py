@@ -21,6 +21,10 @@ class Answer(enum.StrEnum):
     wrong = "wrong"
 
 
+class Quit(KeyboardInterrupt):
+    """The answer ``quit`` where nothing but an exception can carry it; outside of a guided capture it is a Ctrl-C."""
+
+
 @final
 @dataclass(frozen=True)
 class Reading:
@@ -120,6 +124,16 @@ class VerdictEvent:
 
 @final
 @dataclass(frozen=True)
+class RequestEvent:
+    """What a person is asked to do in the middle of a step, such as to show a picture, and the answers offered."""
+
+    sentence: str
+    offered: tuple[Answer, ...]
+    event: Literal["request"] = "request"
+
+
+@final
+@dataclass(frozen=True)
 class DoneEvent:
     """The capture has ended; it is complete when every step was captured, and stopped when the person has quit."""
 
@@ -129,7 +143,7 @@ class DoneEvent:
     event: Literal["done"] = "done"
 
 
-Event = StepEvent | ReadingsEvent | ProgressEvent | VerdictEvent | DoneEvent
+Event = StepEvent | ReadingsEvent | ProgressEvent | VerdictEvent | RequestEvent | DoneEvent
 
 
 @runtime_checkable

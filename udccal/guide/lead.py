@@ -13,6 +13,7 @@ from udccal.guide.events import (
     DoneEvent,
     Person,
     ProgressEvent,
+    Quit,
     ReadingsEvent,
     StepEvent,
     VerdictEvent,
@@ -117,7 +118,10 @@ class Leading:
             return self._verdict(step, False, sentence, _LACKING)
         if self._captured(step):
             self.writer.capture_again(step.step_ids)
-        answer = self._carry_out(step)
+        try:
+            answer = self._carry_out(step)
+        except Quit:  # asked to show a picture
+            answer = Answer.quit
         if answer is not Answer.again:  # else the next visit captures what this one has left
             self.writer.keep_captured(step.step_ids)
         return answer

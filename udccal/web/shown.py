@@ -5,7 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import final
 
-from udccal.guide.events import Answer, DoneEvent, Event, ProgressEvent, ReadingsEvent, StepEvent, VerdictEvent
+from udccal.guide.events import (
+    Answer,
+    DoneEvent,
+    Event,
+    ProgressEvent,
+    ReadingsEvent,
+    RequestEvent,
+    StepEvent,
+    VerdictEvent,
+)
 
 
 @final
@@ -26,11 +35,12 @@ class Shown:
     readings: ReadingsEvent | None = None
     progress: ProgressEvent | None = None
     verdict: VerdictEvent | None = None
+    request: RequestEvent | None = None
     done: DoneEvent | None = None
     question: Question | None = None
 
     def after(self, event: Event) -> Shown:
-        """The same after one more event. A step, a verdict and the end close the question, and end the readings."""
+        """The same after one more event. All but readings and progress close the question."""
         match event:
             case StepEvent():
                 return Shown(step=event)
@@ -40,9 +50,11 @@ class Shown:
                 return replace(self, progress=event)
             case VerdictEvent():
                 return replace(self, verdict=event, readings=None, question=None)
+            case RequestEvent():
+                return replace(self, request=event, readings=None, question=None)
             case DoneEvent():
                 return Shown(step=self.step, done=event)
 
     def answered(self) -> Shown:
-        """The same after an answer: the question and the verdict that led to it are past."""
-        return replace(self, verdict=None, progress=None, question=None)
+        """The same after an answer: the question and what led to it are past."""
+        return replace(self, verdict=None, request=None, progress=None, question=None)

@@ -12,7 +12,7 @@ from udccal.cameras.protocol import Frame
 from udccal.cli.jobs.capture import Wanted, open_session, refuse_unknown
 from udccal.cli.output import Output
 from udccal.guide.capture import lead_capture
-from udccal.guide.events import Answer, DoneEvent, Event, Outline, Person, VerdictEvent
+from udccal.guide.events import Answer, DoneEvent, Event, Outline, Person, Quit, RequestEvent
 from udccal.guide.people import Agreeing, Practising
 from udccal.rig import RigDescription
 from udccal.simulation.hand import Hand
@@ -57,13 +57,18 @@ def led_by(output: Output, person: Person, agree: bool) -> Person:
 
 
 def show_on_panel(person: Person, sentence: str) -> bool:
-    """Ask a person to show a picture on the panel, and return whether it was done."""
+    """Ask a person to show a picture on the panel, and return True when it is done.
+
+    Raises:
+        Quit: when the person stops instead.
+    """
     offered = (Answer.go, Answer.quit)
-    person.tell(VerdictEvent("panel", True, f"{sentence} Go on when it is done.", offered))
-    while True:
-        answer = person.answer(offered, 3600.0)
-        if answer is not None:
-            return answer is Answer.go
+    person.tell(RequestEvent(f"{sentence} Go on when it is done.", offered))
+    while (answer := person.answer(offered, 3600.0)) is None:
+        pass
+    if answer is Answer.quit:
+        raise Quit
+    return True
 
 
 def capture_led(output: Output, bench: CaptureBench, person: Person, wanted: Wanted) -> DoneEvent:

@@ -19,6 +19,7 @@ from udccal.guide.events import (
     ProgressEvent,
     Reading,
     ReadingsEvent,
+    RequestEvent,
     StepEvent,
     VerdictEvent,
 )
@@ -53,7 +54,7 @@ class TerminalPerson:
 
     def tell(self, event: Event) -> None:
         """Print an event."""
-        if isinstance(event, StepEvent | VerdictEvent) and sys.stdin.isatty():
+        if isinstance(event, StepEvent | VerdictEvent | RequestEvent) and sys.stdin.isatty():
             self._forget_enters()
         match event:
             case StepEvent():
@@ -69,6 +70,9 @@ class TerminalPerson:
             case VerdictEvent():
                 self._asked = ()
                 self._output.say(f"  {'✓' if event.ok else '✗'} {event.sentence}")
+            case RequestEvent():
+                self._asked = ()
+                self._output.say(f"  {event.sentence}")
             case DoneEvent():
                 self._output.say(event.sentence)
 
