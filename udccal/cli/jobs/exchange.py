@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import final
 
 from udccal.cli.output import Output
+from udccal.comparison.place import place_of
 from udccal.io.out_folder import storing_in
 from udccal.profiles.exchange.exports import EXPORTS, covariance_file, export_profile
 from udccal.profiles.exchange.imports import IMPORTS, profile_of, read_lens
@@ -18,12 +19,16 @@ from udccal.rig import load_rig
 @final
 @dataclass(frozen=True)
 class ExportSummary:
-    """Result of ``profile export``; ``not_held`` are sentences that say what the file cannot hold."""
+    """Result of ``profile export``; ``not_held`` are sentences that say what the file cannot hold.
+
+    ``place`` says who tells the camera's place in the file; null where the file has none.
+    """
 
     profile: Path
     file: Path
     covariance: Path
     not_held: tuple[str, ...]
+    place: str | None
 
 
 @final
@@ -51,8 +56,9 @@ def export(output: Output, path: Path, to: str, out: Path) -> None:
         UdccalError: when the file cannot be written.
     """
     profile, into = load_profile(path), EXPORTS[to]
+    place = place_of(profile)
     with storing_in(out.parent):
-        export_profile(profile, into, out)
+        export_profile(profile, into, out, place)
     beside = covariance_file(out)
     output.say(f"{path} -> {out}, its covariance {beside}")
     for term in into.terms:
@@ -61,7 +67,9 @@ def export(output: Output, path: Path, to: str, out: Path) -> None:
             output.say(f"{term}: {status.value}")
     for sentence in into.not_held:
         output.say(sentence)
-    output.result(ExportSummary(path, out, beside, into.not_held))
+    if into.posed:
+        output.say(place.what)
+    output.result(ExportSummary(path, out, beside, into.not_held, place.what if into.posed else None))
 
 
 def import_(output: Output, of: str, file: Path, rig: str, out: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from udccal.errors import ProfileError
 from udccal.io.atomic import write_atomically
 from udccal.profiles.exchange import estimates_csv, mrcal, npz, opencv_yaml, ros_camera_info
-from udccal.profiles.exchange.format import ExportFormat
+from udccal.profiles.exchange.format import ExportFormat, Place
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import check_outside_profiles
 from udccal.result import Estimate
@@ -39,6 +39,17 @@ class _TermCovariance:
 
 @final
 @dataclass(frozen=True)
+class _StoredPlace:
+    """Of the camera, in the panel's frame; ``what`` says who tells it, and the rest is null where nobody does."""
+
+    what: str
+    pupil_mm: list[float]
+    sigma_mm: list[float] | None
+    covariance_mm2: list[list[float]] | None
+
+
+@final
+@dataclass(frozen=True)
 class _Covariances:
     """What the file beside an export holds; docs/profile.md describes it."""
 
@@ -50,6 +61,7 @@ class _Covariances:
     exported_to: str
     not_held: tuple[str, ...]
     terms: tuple[_TermCovariance, ...]
+    place: _StoredPlace | None
 
 
 def covariance_file(path: Path) -> Path:
@@ -57,12 +69,13 @@ def covariance_file(path: Path) -> Path:
     return Path(f"{path}.json")
 
 
-def export_profile(profile: Profile, to: ExportFormat, path: Path) -> None:
+def export_profile(profile: Profile, to: ExportFormat, path: Path, place: Place | None = None) -> None:
     """Write a profile for another program, with the covariance beside it.
 
     Args:
         profile: the rig as measured.
         to: the format.
+        place: of the camera, for formats that hold it; None for the geometry term's own, which is nominal.
         path: the new file; ``covariance_file(path)`` is written, too.
 
     Raises:
@@ -74,7 +87,9 @@ def export_profile(profile: Profile, to: ExportFormat, path: Path) -> None:
     for file in (path, beside):
         if os.path.lexists(file):
             raise ProfileError(f"Expected a new file, found that {file} exists. Remove it, or choose another name.")
-    content, known = to.encode(profile), dataclasses.asdict(_covariances(profile, to))
+    place = place if to.posed else None
+    content = to.encode(profile if place is None else _placed(profile, place))
+    known = dataclasses.asdict(_covariances(profile, to, place))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(beside, json.dumps(known, indent=1, allow_nan=False).encode("utf-8") + b"\n")
     try:
@@ -84,9 +99,28 @@ def export_profile(profile: Profile, to: ExportFormat, path: Path) -> None:
         raise
 
 
-def _covariances(profile: Profile, to: ExportFormat) -> _Covariances:
+def _placed(profile: Profile, place: Place) -> Profile:
+    term = dataclasses.replace(profile.geometry.term, pupil_mm=place.pupil_mm)
+    return dataclasses.replace(profile, geometry=dataclasses.replace(profile.geometry, term=term))
+
+
+def _covariances(profile: Profile, to: ExportFormat, place: Place | None) -> _Covariances:
     made, results = profile.provenance, [profile.result(name) for name in to.terms]
     terms = tuple(_TermCovariance(r.name, r.status.name, r.estimates, np.asarray(r.cov).tolist()) for r in results)
     return _Covariances(
-        FORMAT, VERSION, profile.rig.name, made.created_at, made.session_sha256, to.name, to.not_held, terms
+        FORMAT,
+        VERSION,
+        profile.rig.name,
+        made.created_at,
+        made.session_sha256,
+        to.name,
+        to.not_held,
+        terms,
+        None if place is None else _stored_place(place),
     )
+
+
+def _stored_place(place: Place) -> _StoredPlace:
+    cov = place.cov_mm2
+    sigma = None if cov is None else np.sqrt(np.diag(cov)).tolist()
+    return _StoredPlace(place.what, place.pupil_mm.tolist(), sigma, None if cov is None else cov.tolist())

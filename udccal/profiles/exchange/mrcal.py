@@ -122,5 +122,6 @@ EXPORT = ExportFormat(
         "It has no optimization inputs, so that mrcal refuses to tell its uncertainty: that is in the .json beside it.",
     ),
     encode=_encode,
+    posed=True,
 )
 IMPORT = ImportFormat(NAME, _decode)

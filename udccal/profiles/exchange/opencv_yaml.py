@@ -75,5 +75,6 @@ EXPORT = ExportFormat(
         "hold noise, wire, psf and backscatter.",
     ),
     encode=_encode,
+    posed=True,
 )
 IMPORT = ImportFormat(NAME, _decode)
