@@ -18,6 +18,7 @@ from udccal.drift.pose import PoseChange
 from udccal.reports.check_page import check_page
 from udccal.reports.page import AnyPage, render
 from udccal.reports.validation_page import validation_page
+from udccal.sessions.schema import TermName
 from udccal.validation.checks import Check, ZMap
 from udccal.validation.limits import ValidationLimits
 from udccal.validation.validate import Validation
@@ -25,13 +26,13 @@ from udccal.validation.validate import Validation
 pytestmark = pytest.mark.medium
 
 
-def validated(ok: bool) -> AnyPage:
+def validated(ok: bool, own: tuple[TermName, ...] = (), partly: tuple[TermName, ...] = ("psf",)) -> AnyPage:
     checks = (
         Check("wire", "pattern", 0.1 if ok else 0.5, 0.2, "%", ok, "The flat has a pattern."),
         Check("psf", "NOT_CAPTURED", None, None, "", None, "The session has no captures of this term."),
     )
     stated = ("2026-01-01T00:00:00+00:00", "2026-01-02T00:00:00+00:00", "0" * 64)
-    found = Validation("f", 1, "toy", ok, "Do <this>.", *stated, ("wire",), ("psf",), checks, ValidationLimits())
+    found = Validation("f", 1, "toy", ok, "Do <this>.", *stated, own, partly, checks, ValidationLimits())
     return validation_page(found, {"wire": ZMap(np.eye(5), "x", "y", "A map.")})
 
 
@@ -46,7 +47,10 @@ def checked(verdict: Verdict) -> AnyPage:
 @pytest.mark.parametrize(
     ("page", "headline"),
     [
-        (lambda: validated(True), "The profile holds."),
+        (lambda: validated(True, partly=()), "The profile holds."),
+        (lambda: validated(True), "The profile holds for wire."),
+        (lambda: validated(True, own=("wire",)), "No test: the profile was fitted to these captures."),
+        (lambda: validated(True, partly=("wire",)), "No test: the profile was fitted to these captures."),
         (lambda: validated(False), "The profile does not hold."),
         (lambda: checked("same"), "The rig is as its profile says."),
         (lambda: checked("changed"), "The rig changed by more than is harmless."),

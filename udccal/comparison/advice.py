@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from udccal.comparison.effects import Effect
 from udccal.comparison.movement import Moved, Movement
 from udccal.comparison.term_diff import TermDiff
+from udccal.result import FitResult
 
 
-def advice(terms: Sequence[TermDiff], moved: Movement, newer: str, lacking: Sequence[str], chance: float) -> str:
+def advice(
+    terms: Sequence[TermDiff], moved: Movement, newer: str, lacking: Sequence[str], better: str, chance: float
+) -> str:
     """Return one sentence.
 
     Args:
@@ -17,28 +20,55 @@ def advice(terms: Sequence[TermDiff], moved: Movement, newer: str, lacking: Sequ
         moved: the movement.
         newer: name of the profile that was made later: A or B.
         lacking: terms that the newer profile lacks and the other one has.
+        better: of two fits of the same captures that differ, which is better, and why; empty where neither is.
         chance: probability below which the movement is significant.
     """
     by = {verdict: [one for one in terms if one.verdict == verdict] for verdict in {one.verdict for one in terms}}
     harmless, unknown = (_names(by.get(verdict, ())) for verdict in ("changed, harmless", "not compared"))
     left = f"; {unknown} could not be compared" if unknown else ""
-    if changed := by.get("changed"):
-        reasons = ", ".join(f"{one.term} ({_said(one.worst)})" for one in changed)
-        found = f"the other one no longer describes {reasons}{_movement(moved, chance)}{left}."
+    refitted, changed = ([one for one in by.get("changed", ()) if one.same_captures is same] for same in (True, False))
+    fits = f"the fits of {_reasons(refitted)} differ, though both are of the same captures" if refitted else ""
+    if changed:
+        also = f"; {fits}" if fits else ""
+        found = f"the other one no longer describes {_reasons(changed)}{_movement(moved, chance)}{also}{left}."
         if lacking:
             return f"Capture {' and '.join(lacking)} for {newer}, the newer profile, then use it: {found}"
         return f"Use {newer}, the newer profile: {found}"
-    if harmless:
-        return f"Go on with either profile: {harmless} changed, too little to matter{_movement(moved, chance)}{left}."
+    if fits:
+        return f"{f'Use {better}' if better else 'Fit the captures again with full effort'}: {fits}{left}."
     if len(by.get("not compared", ())) == len(terms):
         return "Capture the terms that a profile lacks: nothing could be compared."
     if unknown:
-        return f"Capture what a profile lacks: {unknown} could not be compared; the other terms agree."
+        others = f"{harmless} changed, too little to matter{_movement(moved, chance)}" if harmless else ""
+        return f"Capture what a profile lacks: {unknown} could not be compared; {others or 'the other terms agree'}."
+    if harmless:
+        return f"Go on with either profile: {harmless} changed, too little to matter{_movement(moved, chance)}."
     return "Go on with either profile: they agree within their error bars."
 
 
 def _names(terms: Sequence[TermDiff]) -> str:
     return " and ".join(one.term for one in terms)
+
+
+def better_fits(results: Mapping[str, Sequence[FitResult]]) -> str:
+    """Return which profile has the better fits of the same captures, and why; empty where neither has.
+
+    Args:
+        results: of the fits that differ, by the name of the profile.
+    """
+    (a, of_a), (b, of_b) = results.items()
+    for why, good in (
+        ("whose fits ended better", lambda one: not one.warning),
+        ("whose fits had more effort", lambda one: one.effort == "full"),
+    ):
+        more = sum(map(good, of_a)) - sum(map(good, of_b))
+        if more:
+            return f"{a if more > 0 else b}, {why}"
+    return ""
+
+
+def _reasons(terms: Sequence[TermDiff]) -> str:
+    return ", ".join(f"{one.term} ({_said(one.worst)})" for one in terms)
 
 
 def _said(effect: Effect) -> str:

@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from udccal.comparison.advice import advice
+from udccal.comparison.advice import advice, better_fits
 from udccal.comparison.comparable import check_comparable
 from udccal.comparison.effects import effects_of
 from udccal.comparison.estimates import ORDER, difference
@@ -37,7 +37,7 @@ class ProfileDiff:
     """Two profiles of one rig compared. docs/diff.md describes each number; ``diff.json`` holds these fields.
 
     Attributes:
-        verdict: the worst of the terms'; a term that a profile lacks is worse than one that is the same.
+        verdict: the worst of the terms'; a term that a profile lacks is worse than one whose change is harmless.
         advice: one sentence that says what to do.
         picture_dB_lost: by restoring frames of the one with the other; wire, psf and backscatter together.
         movement: of the camera against the panel, from A to B.
@@ -92,12 +92,14 @@ def compare(a: Profile, b: Profile, limits: DiffLimits) -> tuple[ProfileDiff, Di
     if a.provenance.created_at > b.provenance.created_at:
         newer, other = other, newer
     lacking = [term for term in ORDER if not_captured(newer[1].result(term)) > not_captured(other[1].result(term))]
+    refitted = [one.term for one in terms if one.verdict == "changed" and one.same_captures]
+    better = better_fits({name: [each.result(term) for term in refitted] for name, each in (("A", a), ("B", b))})
     answer = ProfileDiff(
         format=FORMAT,
         version=VERSION,
         rig=a.rig.name,
         verdict=verdict,
-        advice=advice(terms, moved, newer[0], lacking, limits.chance),
+        advice=advice(terms, moved, newer[0], lacking, better, limits.chance),
         a=_compared(a),
         b=_compared(b),
         terms=terms,

@@ -14,7 +14,7 @@ from udccal.profiles.profile import Profile
 from udccal.result import FitResult, FitStatus
 from udccal.sessions.schema import TermName
 
-Verdict = Literal["same", "not compared", "changed, harmless", "changed"]
+Verdict = Literal["same", "changed, harmless", "not compared", "changed"]
 # From best to worst.
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 

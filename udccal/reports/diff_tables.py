@@ -11,24 +11,18 @@ from udccal.reports.tables import Table, number, spread
 
 def terms_table(found: ProfileDiff) -> Table:
     """Return each term's verdict, chi-squared and most important effect."""
-    rows = tuple(
-        (
-            one.term,
-            one.verdict,
-            *_chi2(one),
-            one.worst.name,
-            f"{one.worst.value:.3g} {one.worst.unit}",
-            _limit(one.worst.limit),
-        )
-        for one in found.terms
-    )
+    rows = tuple((one.term, one.verdict, *_chi2(one), *_worst(one)) for one in found.terms)
     return Table("Terms", ("term", "verdict", "χ²", "of", "effect", "value", "limit"), rows, frozenset({2, 3, 5, 6}))
 
 
 def effects_table(one: TermDiff) -> Table:
     """Return all effects of a term."""
     rows = tuple((e.name, f"{e.value:.3g} {e.unit}", _limit(e.limit), spread(e.error)) for e in one.effects)
-    return Table("What it does to what is seen", ("effect", "value", "limit", "error"), rows, frozenset({1, 2, 3}))
+    # What stands for a term that nobody measured is the rig description's.
+    nominal = ", with nominal numbers where none were measured" if one.verdict == "not compared" else ""
+    return Table(
+        f"What it does to what is seen{nominal}", ("effect", "value", "limit", "error"), rows, frozenset({1, 2, 3})
+    )
 
 
 def estimates_diff_table(one: TermDiff) -> Table:
@@ -80,12 +74,26 @@ def movement_sentence(found: ProfileDiff) -> str:
         said += f" (χ² {moved.agreement_chi2:.4g} of {moved.agreement_dof})."
         said += "" if agree else " Something else changed, too."
     if moved.whole_pitches is None:
-        said += " Whole pitches of the panel are not known: backscatter does not see its place well enough."
+        said += f" Whole pitches of the panel are not known: {_why_no_pitches(found)}."
     return said
+
+
+def _why_no_pitches(found: ProfileDiff) -> str:
+    """Why wire and backscatter, which tell them together, do not."""
+    of = {one.term: one for one in found.terms if one.term in ("wire", "backscatter")}
+    if same := [name for name, one in of.items() if one.same_captures]:
+        return (
+            f"{_listed(tuple(same))} of both profiles {'was' if len(same) == 1 else 'were'} fitted to the same captures"
+        )
+    if lacking := [name for name in of if name not in found.movement.terms]:
+        return f"not both profiles have measured {_listed(tuple(lacking))}"
+    return "backscatter does not see its place well enough"
 
 
 def finding(one: TermDiff) -> str:
     """Return chi-squared of a term as a sentence, with its largest deviation."""
+    if one.verdict == "not compared":
+        return "Not both profiles have measured this term: nothing can be told of it."
     if not one.dof:
         return "No estimate of this term has a covariance in both profiles: only the effects below are compared."
     largest = max(one.estimates, key=lambda e: abs(e.difference) / e.sigma)
@@ -101,6 +109,13 @@ def notes(one: TermDiff) -> tuple[str, ...]:
     names = "; ".join(quantity(one.term, name).plain for name in one.not_covered)
     left = (f"Not in χ², as no covariance is kept of it: {names}.",) if names else ()
     return (*one.notes, *left)
+
+
+def _worst(one: TermDiff) -> tuple[str, str, str]:
+    """The most important effect; none of a term that was not compared, which would be of nominal numbers."""
+    if one.verdict == "not compared":
+        return "–", "–", "–"
+    return one.worst.name, f"{one.worst.value:.3g} {one.worst.unit}", _limit(one.worst.limit)
 
 
 def _chi2(one: TermDiff) -> tuple[str, str]:

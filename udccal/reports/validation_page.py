@@ -17,7 +17,7 @@ from udccal.validation.validate import Validation
 
 def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> ValidationPage:
     """Build the page of one validation."""
-    headline, mood = ("The profile holds.", "good") if found.ok else ("The profile does not hold.", "bad")
+    headline, mood = _headline(found)
     return ValidationPage(
         title=f"A profile of {found.rig}, validated by a session",
         advice=Advice(headline, mood, (found.advice,)),
@@ -29,6 +29,19 @@ def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> Validat
         ),
         sections=_sections(found.checks, maps),
     )
+
+
+def _headline(found: Validation) -> tuple[str, str]:
+    """The verdict and its colour: what was fitted to these captures, even in part, is no test of the profile."""
+    if not found.ok:
+        return "The profile does not hold.", "bad"
+    known = (*found.own_terms, *found.partly_own_terms)
+    tested = dict.fromkeys(one.term for one in found.checks if one.ok is not None and one.term not in known)
+    if not known:
+        return "The profile holds.", "good"
+    if tested:
+        return f"The profile holds for {' and '.join(tested)}.", "good"
+    return "No test: the profile was fitted to these captures.", "careful"
 
 
 def _whose(found: Validation) -> str:
