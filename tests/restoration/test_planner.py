@@ -36,9 +36,14 @@ def frame(profile: Profile) -> np.ndarray:
     return (64 + 0.355 * rng.poisson(light)).astype(np.uint16)
 
 
-def plan_of(profile: Profile, frame: np.ndarray, asked: Tier | Wish, forecast: bool = False) -> ScenePlan:
-    stages = chosen_stages(profile, frame, EXPOSURE_S, None)
-    return planned(profile, frame, EXPOSURE_S, None, asked, stages, forecast)
+BLACK = np.zeros((24, 32, 3), np.uint8)
+
+
+def plan_of(
+    profile: Profile, frame: np.ndarray, asked: Tier | Wish, forecast: bool = False, shown: np.ndarray | None = BLACK
+) -> ScenePlan:
+    stages = chosen_stages(profile, frame, EXPOSURE_S, shown)
+    return planned(profile, frame, EXPOSURE_S, shown, asked, stages, forecast)
 
 
 def refuse(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
@@ -91,8 +96,22 @@ def test_the_forecast_says_what_each_tier_gives(
 @pytest.mark.usefixtures("quick")
 def test_without_a_psf_only_times_are_expected(profile: Profile, frame: np.ndarray) -> None:
     sharp = replace(profile, psf=replace(profile.psf, status=FitStatus.ABSENT))
-    plan = plan_of(sharp, frame, Wish(min_psnr_dB=30.0), forecast=True)
+    plan = plan_of(sharp, frame, Wish(), forecast=True)
     assert [each.psnr_dB for each in plan.tiers] == [None] * len(Tier)
+    with pytest.raises(RestorationError, match="no PSNR can be told of this profile"):
+        plan_of(sharp, frame, Wish(min_psnr_dB=30.0))
+
+
+@pytest.mark.usefixtures("quick")
+def test_no_psnr_is_told_where_a_lit_panels_picture_is_not_known(
+    profile: Profile, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse(monkeypatch, "expected_error", "kernel_grid")
+    lit = replace(profile, backscatter_mask=profile.backscatter_mask + np.float32(2e4))
+    plan = plan_of(lit, frame, Wish(), forecast=True, shown=None)
+    assert [each.psnr_dB for each in plan.tiers] == [None] * len(Tier)
+    with pytest.raises(RestorationError, match="the panel's picture for a least PSNR, found that it is not known"):
+        plan_of(lit, frame, Wish(min_psnr_dB=1.0), shown=None)
 
 
 def test_a_frame_of_another_camera_is_refused_first(

@@ -58,6 +58,11 @@ def test_what_no_tier_does_is_refused(wish: Wish, message: str) -> None:
         chosen_tier(TIERS, wish)
 
 
+def test_a_least_psnr_is_refused_where_none_is_known() -> None:
+    with pytest.raises(RestorationError, match="found that none can be told"):
+        chosen_tier(tuple(replace(each, psnr_dB=None) for each in TIERS), Wish(min_psnr_dB=1.0))
+
+
 @pytest.fixture
 def plan(profile: Profile) -> ScenePlan:
     stages = (StageChoice(Stage.wire, True, "why not"), StageChoice(Stage.backscatter, False, "the panel is black"))

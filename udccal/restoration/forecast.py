@@ -4,7 +4,8 @@ The three quicker tiers' pictures are made. What ``balanced`` takes out of that 
 much noise it leaves. Each place also gets the variance of the detail that the tile's filter loses (``lost_detail``);
 within a tile it follows the square of the light. How much detail there is where the filter finds none, the finest
 detail that it finds tells: where two octaves of it hardly differ, the scene goes on as strong. The quicker tiers differ
-from ``balanced`` by errors of their own. Errors of the profile, and light that clips, are not part of it.
+from ``balanced`` by errors of their own. Errors of the profile, light that clips, and what is left of
+the light of a panel whose picture is not known, are not part of it.
 """
 
 from __future__ import annotations
@@ -74,17 +75,16 @@ def expected_error(
     exposure_s: float,
     panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
     keep: Path | None = None,
-) -> ExpectedError | None:
-    """Return the errors that a frame is expected to be restored with; None where a profile has no psf.
+) -> ExpectedError:
+    """Return the errors that a frame is expected to be restored with, what is left of the panel's light not counted.
 
     Args:
-        preview, restorer: of the tiers preview and balanced, of the same profile.
+        preview, restorer: of the tiers preview and balanced, of the same profile, which has a psf.
         mosaic, exposure_s, panel_picture: as for ``Restorer.restore``, with its errors.
         keep: folder that keeps what depends on the profile alone; None to keep nothing.
     """
     sharpener = restorer.sharpener
-    if sharpener is None:
-        return None
+    assert sharpener is not None
     depends_on, source = (sharpener.grid, sharpener.layout, sharpener.cfa), (sharpener.layout, sharpener.cfa)
     lost = kept(keep, LostDetail, depends_on, lambda: lost_detail(sharpener.tables, *source))
     light = restorer.scene_light(mosaic, exposure_s, panel_picture)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from udccal.cfa import cfa_named
+from udccal.errors import RestorationError
 from udccal.profiles.profile import Profile
 from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.forecast import expected_error
@@ -44,7 +45,8 @@ def planned(
         keep: folder that keeps what is computed; None to keep nothing.
 
     Raises:
-        RestorationError: when no tier does what is asked, or the profile gives no finite values.
+        RestorationError: when no tier does what is asked, a least PSNR is asked where none can be told (no psf, or a
+            panel whose picture is not known), or the profile gives no finite values.
     """
     check_frame(mosaic, exposure_s, profile.rig)
     check_panel_picture(panel_picture, profile.rig)
@@ -55,12 +57,32 @@ def planned(
     preview = Restorer.from_profile(profile, Tier.preview, keep=keep, without=without)
     tiers = _timed(profile, preview, mosaic, keep)
     chosen_tier(tiers, Wish(budget_ms=wish.budget_ms))  # refuses before kernels are computed
-    if forecast or wish.min_psnr_dB is not None:
+    untold = _untold(profile, panel_picture is None and preview.mask is not None)
+    if wish.min_psnr_dB is not None and untold:
+        raise RestorationError(untold)
+    if not untold and (forecast or wish.min_psnr_dB is not None):
         restorer = Restorer.from_profile(profile, Tier.balanced, keep=keep, without=without)
         error = expected_error(preview, restorer, mosaic, exposure_s, panel_picture, keep)
-        if error is not None:
-            tiers = tuple(TierForecast(each.tier, error.psnr_dB(each.tier), each.frame_ms) for each in tiers)
+        tiers = tuple(TierForecast(each.tier, error.psnr_dB(each.tier), each.frame_ms) for each in tiers)
     return ScenePlan.of(profile, tier or chosen_tier(tiers, wish), stages, tiers)
+
+
+def _untold(profile: Profile, panel_unknown: bool) -> str:
+    """Return why no PSNR can be told, and what to do; empty where one can.
+
+    What is left of the light of a panel whose picture is not known depends on that picture: the frame does not tell it.
+    """
+    if profile.psf.unfitted:
+        return (
+            "Expected a profile with a psf for a least PSNR, found one without: no PSNR can be told of this profile. "
+            "Leave the least PSNR out."
+        )
+    if panel_unknown:
+        return (
+            "Expected the panel's picture for a least PSNR, found that it is not known: how much of the panel's light "
+            "is left depends on it. Give it, or leave the least PSNR out."
+        )
+    return ""
 
 
 def _timed(

@@ -119,7 +119,8 @@ def chosen_tier(tiers: tuple[TierForecast, ...], wish: Wish) -> Tier:
         wish: what is asked.
 
     Raises:
-        RestorationError: when no tier keeps the budget, or none that does is good enough.
+        RestorationError: when no tier keeps the budget, none that does is good enough, or a least PSNR is asked and no
+            PSNR is known.
     """
     if wish == Wish():
         return DEFAULT_TIER
@@ -133,12 +134,17 @@ def chosen_tier(tiers: tuple[TierForecast, ...], wish: Wish) -> Tier:
         )
     if wish.min_psnr_dB is None:
         return quick[-1].tier
-    good = [each for each in quick if each.psnr_dB is None or each.psnr_dB >= wish.min_psnr_dB]
+    told = {each: each.psnr_dB for each in quick if each.psnr_dB is not None}
+    if not told:
+        raise RestorationError(
+            "Expected a PSNR of each tier for a least PSNR, found that none can be told. Leave the least PSNR out."
+        )
+    good = [each for each, psnr_dB in told.items() if psnr_dB >= wish.min_psnr_dB]
     if not good:
-        best = max(quick, key=lambda each: each.psnr_dB or 0.0)
+        best = max(told, key=lambda each: told[each])
         raise RestorationError(
             f"Expected a PSNR that a tier reaches, found {wish.min_psnr_dB:g} dB: the best within the budget, "
-            f"{best.tier}, is expected to reach {best.psnr_dB:.1f} dB on this frame. Ask for less, or give more time."
+            f"{best.tier}, is expected to reach {told[best]:.1f} dB on this frame. Ask for less, or give more time."
         )
     return good[0].tier
 
