@@ -59,6 +59,7 @@ def test_files_become_images(profile_folder: Path, tmp_path: Path) -> None:
     raw_files = write_raw_files(tmp_path / "raw", 6)
     (tmp_path / "my_hook.py").write_text("def mark(p, n):\n    p[0, 0] = n\n    return p\n")
     log, out = tmp_path / "log.jsonl", tmp_path / "out"
+    log.write_text("of an earlier run")
     source = ["--camera", "files", "--files", raw_files, "--exposure-s", "0.001", "--fps", "1"]
     hook = ["--hook", "my_hook:mark", "--hook-ms", "2000"]
     words = command("--profile", profile_folder, "--sink", f"images:{out}", "--log", log, *source, *hook)
@@ -137,6 +138,22 @@ def test_what_cannot_begin_is_refused_before_the_profile_is_read(
     )
     with pytest.raises(UdccalError, match=message):
         run_live(Output(), replace(wanted, **changes))
+
+
+def test_a_run_that_cannot_begin_leaves_its_log_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
+    (tmp_path / "earlier").write_text("earlier")
+    for name in ("earlier", "new"):
+        camera = LiveCamera("sim", None, None, None, 30.0, 0)
+        limits, log = Limits(frames=1), tmp_path / name
+        with pytest.raises(UdccalError, match="no-such-profile"):
+            run_live(
+                Output(),
+                LiveRun(
+                    Path("no-such-profile"), Tier.preview, camera, "shm:a", None, None, "cpu", None, 1.0, limits, log
+                ),
+            )
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("earlier", "earlier")]
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def run(profile: Profile) -> Figures:
     camera = LiveCamera("u3v", None, None, 2e-3, 25.0, 0)
     restorer = Restorer.from_profile(profile, Tier.preview)
     with camera.open(profile.rig) as deliver:
-        frames = deliver(restorer.view, None, restorer.seen_rows)
+        frames, _ = deliver(restorer.view, None, restorer.seen_rows)
         pipeline = Pipeline(frames, restore, SHAPE, ListSink(), None, Limits(frames=5), threading.Event())
         return pipeline.run(lambda figures: None)
 
@@ -78,7 +78,9 @@ def test_rows_are_read_in_the_cameras_steps(
 def test_it_reads_the_rows_that_the_view_needs(live_profile: Profile, plugged: U3vCamera) -> None:
     camera, restorer = LiveCamera("u3v", None, None, 2e-3, 25.0, 0), Restorer.from_profile(live_profile, Tier.preview)
     with camera.open(live_profile.rig) as deliver:
-        frame = next(deliver(restorer.view, None, slice(24, 40)))
+        frames, read = deliver(restorer.view, None, slice(24, 40))
+        frame = next(iter(frames))
+    assert read == slice(8, 56)
     assert frame.settings.region == Region(0, 8, 96, 48)
     assert frame.data.shape == (48, 96)
 

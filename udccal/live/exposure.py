@@ -7,11 +7,11 @@ from typing import Final, final
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from udccal.restoration.tone import Tone, display_exposure
+from udccal.restoration.tone import LEVEL, PERCENTILE, Tone, display_exposure
 
 # Every so many pixels are looked at.
 _STEP: Final = 8
-_PERCENTILE, _WANTED, _WHITE = 97.0, 0.9 * 255, 255
+_WHITE = 255
 # Part of the way to the wanted exposure that one frame goes, in logarithms: a third of a second at 30 Hz.
 _PART: Final = 0.1
 
@@ -22,27 +22,26 @@ class AutoExposure:
 
     Args:
         linear: a first picture in e-/s.
+        least: light in e-/s that counts as bright where all is darker.
     """
 
-    def __init__(self, linear: Float32[np.ndarray, "rows columns 3"]) -> None:
-        self.tone = Tone(display_exposure(linear[::_STEP, ::_STEP]))
+    def __init__(self, linear: Float32[np.ndarray, "rows columns 3"], least: float) -> None:
+        self.tone = Tone(display_exposure(linear[::_STEP, ::_STEP], least))
 
-    def follow(self, shown: UInt8[np.ndarray, "rows columns 3"]) -> None:
+    def follow(self, shown: UInt8[np.ndarray, "rows columns 3"]) -> bool:
         """Move towards the exposure at which ``shown`` would be as bright as a still picture.
 
-        A black picture says nothing. A white one says only that the exposure is too long: it is halved.
+        A black picture says nothing. A white one says only that the exposure is far too long.
+
+        Returns:
+            whether it can be followed: after a white picture, the next one has to begin anew.
         """
         codes = shown[::_STEP, ::_STEP]
-        level = float(np.percentile(codes, _PERCENTILE))
-        if level == 0:
-            return
-        if np.median(codes) == _WHITE:
-            factor = 0.5
-        elif level == _WHITE:
-            factor = 0.5**_PART
-        else:
-            factor = float(_linear(_WANTED) / _linear(level)) ** _PART
-        self.tone = Tone(self.tone.exposure * factor, self.tone.gains)
+        level = float(np.percentile(codes, PERCENTILE))
+        if level > 0:
+            factor = 0.5 if level == _WHITE else float(_linear(LEVEL * _WHITE) / _linear(level))
+            self.tone = Tone(self.tone.exposure * factor**_PART, self.tone.gains)
+        return bool(np.median(codes) < _WHITE)
 
 
 def _linear(code: float) -> Float[np.ndarray, ""]:

@@ -29,7 +29,8 @@ class ProfileFollower:
         self._settled = self._state()
         self._said: tuple[tuple[int, int], str] | None = None
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="profile", daemon=True)
+        # No daemon: Python ends in native code of a profile that is being loaded only by aborting the process.
+        self._thread = threading.Thread(target=self._follow, name="profile")
 
     def __enter__(self) -> ProfileFollower:
         self._thread.start()
@@ -37,6 +38,9 @@ class ProfileFollower:
 
     def __exit__(self, *error: object) -> None:
         self._ended.set()
+        self._thread.join(_EVERY_S)
+        if self._thread.is_alive():
+            self._say(f"The profile {self._path} is still being loaded; the program ends after that.")
 
     def _follow(self) -> None:
         while not self._ended.wait(_EVERY_S):
@@ -54,13 +58,18 @@ class ProfileFollower:
             self._say_once(state, error)  # it may be half copied
         else:
             self._settled = state
-            self._say(f"The profile {self._path} has changed; frames are restored with the new one from now on.")
+            self._tell(f"The profile {self._path} has changed; frames are restored with the new one from now on.")
 
     def _say_once(self, state: tuple[int, int], error: Exception) -> None:
         said = state, f"The profile {self._path} has changed and cannot be used; the earlier one is kept. {error}"
         if said != self._said:
             self._said = said
-            self._say(said[1])
+            self._tell(said[1])
+
+    def _tell(self, sentence: str) -> None:
+        """Say what concerns frames that still come."""
+        if not self._ended.is_set():
+            self._say(sentence)
 
     def _state(self) -> tuple[int, int] | None:
         """Return what changes with the profile; None where there is none at the moment."""

@@ -6,7 +6,7 @@ The camera may read fewer rows than the sensor has.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import final
+from typing import Final, final
 
 import jax
 import numpy as np
@@ -17,9 +17,13 @@ from udccal.errors import LiveError, PanelPictureError
 from udccal.live.exposure import AutoExposure
 from udccal.live.own_pictures import OwnPictures, PanelPicture
 from udccal.restoration.device.restorer import DeviceRestorer
+from udccal.restoration.linear import variance_floor_e2
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone
 from udccal.rig import RigDescription
+
+# Light that the first exposure shows as bright, in sigma of a dark sample: a dark beginning is not amplified to white.
+_LEAST_SIGMAS: Final = 10.0
 
 
 def unnoted() -> None:
@@ -34,8 +38,10 @@ class Restoring:
         restorer: the first restorer.
         panel: what the panel shows: always the same 8-bit RGB picture, or the run's own; None when not known.
         device: of JAX, on which frames are restored; None for the processor.
+        read: rows of the sensor that the camera reads; None for all.
 
     Raises:
+        LiveError: when it lacks rows that the view needs.
         RestorationError: when the tier does not run on a device.
     """
 
@@ -44,11 +50,13 @@ class Restoring:
         restorer: Restorer,
         panel: PanelPicture | OwnPictures | None = None,
         device: jax.Device | None = None,
+        read: slice | None = None,
     ) -> None:
         self._panel, self._device = panel, device
         self._exposure: AutoExposure | None = None
         self._whole: UInt16[np.ndarray, "sensor_rows sensor_columns"] | None = None
-        self._read = slice(0, restorer.rig.camera.rows)
+        self._read = slice(0, restorer.rig.camera.rows) if read is None else read
+        self._check_rows(restorer)
         self._shows = self._warm(restorer)
 
     @property
@@ -109,9 +117,13 @@ class Restoring:
         shown: PanelPicture | None,
     ) -> UInt8[np.ndarray, "rows columns 3"]:
         if self._exposure is None:
-            self._exposure = AutoExposure(_restorer_of(shows).restore(mosaic, exposure_s, shown))
+            restorer = _restorer_of(shows)
+            noise_e = variance_floor_e2(restorer.noise, exposure_s) ** 0.5
+            linear = restorer.restore(mosaic, exposure_s, shown)
+            self._exposure = AutoExposure(linear, _LEAST_SIGMAS * noise_e / exposure_s)
         picture = shows.display(mosaic, exposure_s, self._exposure.tone, shown)
-        self._exposure.follow(picture)
+        if not self._exposure.follow(picture):
+            self._exposure = None
         return picture
 
     def _shown(self, captured_ns: int) -> PanelPicture | None:

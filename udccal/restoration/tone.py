@@ -11,7 +11,8 @@ from jaxtyping import Float, Float32, UInt8, UInt16
 from udccal.arguments import check_number
 from udccal.errors import RestorationError
 
-_PERCENTILE, _LEVEL = 97.0, 0.9
+# A still picture's exposure brings this percentile of its light to this display-encoded value.
+PERCENTILE, LEVEL = 97.0, 0.9
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,13 @@ def encode_srgb(linear: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*sh
     return np.where(clipped <= 0.0031308, np.float32(12.92) * clipped, np.float32(1.055) * root - np.float32(0.055))
 
 
-def display_exposure(linear: Float[np.ndarray, "rows columns 3"]) -> float:
-    """Return the factor on ``linear`` light that brings its 97th percentile to the display-encoded value 0.9."""
-    level = float(np.percentile(linear, _PERCENTILE))
-    return ((_LEVEL + 0.055) / 1.055) ** 2.4 / max(level, 1e-12)
+def display_exposure(linear: Float[np.ndarray, "rows columns 3"], least: float = 1e-12) -> float:
+    """Return the factor on ``linear`` light that brings its 97th percentile to the display-encoded value 0.9.
+
+    Where the percentile is below ``least``, it brings this to 0.9.
+    """
+    level = float(np.percentile(linear, PERCENTILE))
+    return ((LEVEL + 0.055) / 1.055) ** 2.4 / max(level, least)
 
 
 def to_rgb8(display: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:

@@ -98,8 +98,8 @@ def run_live(output: Output, wanted: LiveRun) -> None:
             deliver = open_.enter_context(wanted.camera.open(profile.rig, profile.provenance.camera))
             restorer = prepared(profile)
             own = None if wanted.mirror_delay_s is None else OwnPictures(profile.rig.panel, wanted.mirror_delay_s)
-            restoring = Restoring(restorer, own or shown, device)
-            frames = deliver(restorer.view, shown, restorer.seen_rows)
+            frames, read = deliver(restorer.view, shown, restorer.seen_rows)
+            restoring = Restoring(restorer, own or shown, device, read)
         open_.enter_context(_ended_by_signals(stop))
         open_.enter_context(follower)
         output.say("Running; Ctrl-C ends it.")
@@ -156,18 +156,26 @@ def _ended_by_signals(stop: threading.Event) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _log(output: Output, path: Path | None) -> Iterator[Callable[[Figures], None]]:
-    """Yield what writes figures to a file, a line of JSON each. The run goes on where that fails: it is worth more."""
+    """Yield what writes figures to a file, a line of JSON each. The run goes on where that fails: it is worth more.
+
+    What a file holds is replaced with the first figures: a run that cannot begin leaves it as it was.
+    """
     if path is None:
         yield lambda figures: None
         return
     try:
-        stream = path.open("w", encoding="utf-8", buffering=1)
+        new = not path.exists()
+        stream = path.open("a", encoding="utf-8", buffering=1)
     except OSError as error:
         raise LiveError(f"Expected --log to name a file that can be written, found: {error}. Name another.") from error
-    cut_short = False
+    begun = cut_short = False
 
     def write(figures: Figures) -> None:
-        nonlocal cut_short
+        nonlocal begun, cut_short
+        if not begun:
+            begun = True
+            with contextlib.suppress(OSError):  # a pipe has no length
+                stream.truncate(0)
         try:
             print(json.dumps(asdict(figures)), file=stream)
         except OSError:
@@ -178,6 +186,8 @@ def _log(output: Output, path: Path | None) -> Iterator[Callable[[Figures], None
     finally:
         with contextlib.suppress(OSError):  # what could not be written before
             stream.close()
+        if new and not begun:
+            path.unlink(missing_ok=True)
         if cut_short:
             output.say(f"The figures in {path} are cut short: it could not be written to.")
 

@@ -35,8 +35,9 @@ _LOOP: Final = 8
 _DEFAULT_EXPOSURE_S: Final = 8e-3
 
 PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
-# Delivers frames of these rows at least; a simulated camera sees a scene that fills the view, and what the panel shows.
-Frames = Callable[[VirtualView, PanelPicture | None, slice], Iterator[Frame]]
+# Delivers frames of these rows at least, and says of which; a simulated camera sees a scene that fills the view, and
+# what the panel shows.
+Frames = Callable[[VirtualView, PanelPicture | None, slice], tuple[Iterator[Frame], slice]]
 # Rows above and below those that the view needs: a profile that replaces this one may see a little further.
 _SPARE_ROWS: Final = 16
 
@@ -85,18 +86,24 @@ class LiveCamera:
             if self.exposure_s is not None:
                 camera = SimulatedCamera(world)
                 check_settings(Settings(self.exposure_s, 0.0, camera.sensor), camera.features, camera.sensor)
-            yield lambda view, shown, rows: looped(self._rendered(world, view, shown, rows), self.rate_hz)
+
+            def simulated(view: VirtualView, shown: PanelPicture | None, rows: slice) -> tuple[Iterator[Frame], slice]:
+                frames = self._rendered(world, view, shown, rows)
+                return looped(frames, self.rate_hz), _rows_of(frames[0].settings.region)
+
+            yield simulated
         elif self.files is not None:
             with FileCamera(self.files, rig.camera.cfa, rig.camera.bits, self.exposure_s) as files:
                 check_camera(files, rig)
                 count = len(list_folder(self.files))
-                yield lambda view, shown, rows: paced(files.frames(count), self.rate_hz)
+                whole = slice(0, rig.camera.rows)
+                yield lambda view, shown, rows: (paced(files.frames(count), self.rate_hz), whole)
         else:
             with u3v_camera(self.serial) if self.kind == "u3v" else pylon_camera(self.serial) as real:
                 _check_specimen(real.identity, made_with)
                 self._set(real, rig)
                 check_camera(real, rig)
-                yield lambda view, shown, rows: streamed(self._reading(real, rows))
+                yield lambda view, shown, rows: self._reading(real, rows)
 
     def _rendered(
         self, world: SimulatedWorld, view: VirtualView, panel_picture: PanelPicture | None, rows: slice
@@ -108,10 +115,11 @@ class LiveCamera:
             camera.configure(Settings(self.exposure_s or scene.exposure_s, 0.0, region))
             return tuple(camera.frames(_LOOP))
 
-    def _reading(self, camera: Camera, rows: slice) -> Camera:
+    def _reading(self, camera: Camera, rows: slice) -> tuple[Iterator[Frame], slice]:
         """Have the camera read these rows."""
-        camera.configure(self._settings(camera, region_of(rows, camera.sensor, camera.features.region_steps)))
-        return camera
+        region = region_of(rows, camera.sensor, camera.features.region_steps)
+        camera.configure(self._settings(camera, region))
+        return streamed(camera), _rows_of(region)
 
     def _settings(self, camera: Camera, region: Region) -> Settings:
         exposure_s = self.exposure_s or _within(_DEFAULT_EXPOSURE_S, camera.features.exposure_s)
@@ -130,6 +138,10 @@ def region_of(rows: slice, sensor: Region, steps: tuple[int, int, int, int]) -> 
     first = max(rows.start - _SPARE_ROWS, 0) // step_y * step_y
     count = -(-(min(rows.stop + _SPARE_ROWS, sensor.rows) - first) // step_rows) * step_rows
     return Region(0, first, sensor.columns, count) if first + count <= sensor.rows else sensor
+
+
+def _rows_of(region: Region) -> slice:
+    return slice(region.y, region.y + region.rows)
 
 
 def _check_specimen(found: CameraIdentity, made_with: StoredCamera | None) -> None:
