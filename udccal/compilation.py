@@ -32,7 +32,12 @@ def compilation_folder() -> Path:
     """
     given, cache = os.environ.get(FOLDER_VARIABLE), os.environ.get("XDG_CACHE_HOME")
     base = Path(given) if given else (Path(cache) if cache else _cache_folder()) / "udccal" / "compilations"
-    return base / f"{platform.machine()}-{hashlib.sha256(_processor()).hexdigest()[:12]}"
+    return base / processor_key()
+
+
+def processor_key() -> str:
+    """Return a name that processors which can do the same share."""
+    return f"{platform.machine()}-{hashlib.sha256(_processor()).hexdigest()[:12]}"
 
 
 def _cache_folder() -> Path:

@@ -83,6 +83,17 @@ def test_json_and_the_file_are_one_plan_that_can_be_pinned(
     assert (folder / "out" / "frame.png").exists()
 
 
+def test_a_pinned_plan_that_leaves_out_what_a_frame_needs_is_refused(folder: Path, profile: Profile) -> None:
+    lit = replace(profile, backscatter_mask=profile.backscatter_mask + np.float32(2e4))
+    write_profile(folder / "lit", replace(lit, psf=replace(lit.psf, status=FitStatus.ABSENT)))
+    of_lit = replace(frames(folder, "black.png"), profile=folder / "lit")
+    explain_plan(Output(), of_lit, Plans(Wish(), None), folder / "made")
+    pinned = Plans(Wish(), folder / "made" / "plan.json")
+    with pytest.raises(RestorationError, match=r"the stage backscatter, which these frames need .* leaves it out"):
+        restore_files(Output(), replace(of_lit, panel_picture=None), pinned, folder / "out", "png")
+    assert not (folder / "out").exists()
+
+
 def test_without_a_wish_it_restores_at_the_most_accurate_tier(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     restore_files(Output(as_json=True), frames(folder), Plans(Wish(), None), folder / "out", "png")
     assert json.loads(capsys.readouterr().out)["tier"] == "balanced"

@@ -15,8 +15,9 @@ import pytest
 from jaxtyping import Float32, Int
 
 from udccal.profiles.profile import Profile
-from udccal.restoration import backscatter, prepared, rectify, runtime, sharpen, view
+from udccal.restoration import backscatter, frame_time, prepared, rectify, runtime, sharpen, view
 from udccal.restoration.backscatter import PanelLight
+from udccal.restoration.frame_time import PartTimes, part_times
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept, prepared_bytes, prepared_folder
 from udccal.restoration.rectify import Interpolation
@@ -72,6 +73,19 @@ def test_an_entry_is_read_again(folder: Path) -> None:
     assert np.array_equal(first.places, again.places)
     assert folder.stat().st_mode & 0o077 == 0
     assert prepared_bytes(folder) == entry(folder).stat().st_size > first.values.nbytes + first.places.nbytes
+
+
+def test_times_are_those_of_a_processor_with_so_many_cores(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache folder may be shared by computers."""
+    monkeypatch.setattr(frame_time, "_measured", lambda options: PartTimes(*(np.array(1e-8) for _ in range(9))))
+    part_times(_OPTIONS, folder)
+    part_times(_OPTIONS, folder)
+    assert len(list(folder.iterdir())) == 1
+    monkeypatch.setattr("os.cpu_count", lambda: 1000)
+    part_times(_OPTIONS, folder)
+    monkeypatch.setattr(frame_time, "processor_key", lambda: "another")
+    part_times(_OPTIONS, folder)
+    assert len(list(folder.iterdir())) == 3
 
 
 def test_without_a_folder_nothing_is_kept() -> None:

@@ -7,6 +7,7 @@ not part of a frame's time; nor are reading and writing files.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from udccal.cfa import Cfa, cfa_named
+from udccal.compilation import processor_key
 from udccal.models.noise import Noise
 from udccal.restoration.clipped import QUICK, THOROUGH, Effort, clipped_tiles, completed
 from udccal.restoration.defects import without_defects
@@ -119,13 +121,14 @@ class FrameSize:
 
 
 def part_times(options: PlanOptions, keep: Path | None = None) -> PartTimes:
-    """Measure this computer, or read what an earlier start measured.
+    """Measure this computer, or read what an earlier start measured on such a processor with as many cores.
 
     Args:
         options: options of the restoration.
         keep: folder that keeps the measurement; None to keep nothing.
     """
-    return kept(keep, PartTimes, (options,), lambda: _measured(options))
+    computer = processor_key(), os.cpu_count() or 1
+    return kept(keep, PartTimes, (options, *computer), lambda: _measured(options))
 
 
 def _measured(options: PlanOptions) -> PartTimes:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal, final
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from udccal.arguments import check_number
 from udccal.errors import RestorationError
@@ -36,8 +36,8 @@ class TierForecast:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     tier: Tier
-    psnr_dB: float | None
-    frame_ms: Annotated[float, Field(ge=0)]
+    psnr_dB: Annotated[float, Field(ge=-100, le=200)] | None
+    frame_ms: Annotated[float, Field(ge=0, le=86400e3)]
 
 
 @final
@@ -67,6 +67,18 @@ class Wish:
             )
 
 
+def _each_stage(choices: tuple[StageChoice, ...]) -> tuple[StageChoice, ...]:
+    if sorted(choice.stage for choice in choices) != sorted(Stage):
+        raise ValueError(f"each of {', '.join(Stage)} once")
+    return choices
+
+
+def _no_tier_twice(tiers: tuple[TierForecast, ...]) -> tuple[TierForecast, ...]:
+    if len({each.tier for each in tiers}) != len(tiers):
+        raise ValueError("each tier at most once")
+    return tiers
+
+
 @final
 @dataclass(frozen=True)
 class ScenePlan:
@@ -76,18 +88,18 @@ class ScenePlan:
         format, version: of the file.
         profile_sha256: of the profile that it was made for (``profile_sha256``).
         tier: the tier at which frames are restored.
-        stages: stages that the scene needs or does not.
-        tiers: what each tier is expected to give; empty where nobody asked.
+        stages: stages that the scene needs or does not, each once.
+        tiers: what each tier is expected to give, each at most once; empty where nobody asked.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     format: Literal["udccal-scene-plan"]
-    version: Literal[1]
+    version: Annotated[int, Field(ge=1, le=1)]
     profile_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     tier: Tier
-    stages: Annotated[tuple[StageChoice, ...], Field(max_length=len(Stage))]
-    tiers: Annotated[tuple[TierForecast, ...], Field(max_length=len(Tier))] = ()
+    stages: Annotated[tuple[StageChoice, ...], AfterValidator(_each_stage)]
+    tiers: Annotated[tuple[TierForecast, ...], AfterValidator(_no_tier_twice)] = ()
 
     @classmethod
     def of(

@@ -95,10 +95,18 @@ class Scene:
             forecast: whether it says what each tier is expected to give.
 
         Raises:
-            RestorationError: when no tier does what is asked, or a pinned plan is not one of this profile.
+            RestorationError: when no tier does what is asked, or a pinned plan is not one of this profile, or leaves
+                out what a frame needs.
         """
         if plans.pinned is not None:
-            return read_scene_plan(plans.pinned, self.profile)
+            plan = read_scene_plan(plans.pinned, self.profile)
+            for choice in self.stages:
+                if choice.runs and choice.stage in plan.without:
+                    raise RestorationError(
+                        f"Expected a plan with the stage {choice.stage}, which these frames need ({choice.why}), found "
+                        f"that {plans.pinned} leaves it out. Let udccal write a plan of these frames (--explain)."
+                    )
+            return plan
         first = self.given.images[0]
         mosaic, exposure_s = self.frame(first)
         with naming(first):
