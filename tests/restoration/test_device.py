@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -198,6 +199,9 @@ def test_what_the_cpu_refuses_is_refused(devices: dict[Tier, DeviceRestorer], fr
         devices[Tier.fast].display(frame[:-2], EXPOSURE_S, TONE)
     with pytest.raises(RestorationError, match="positive exposure"):
         devices[Tier.fast].display(frame, 0.0, TONE)
+    display = inspect.unwrap(DeviceRestorer.display)  # programs do not have the tests' own check of types
+    with pytest.raises(RestorationError, match="Expected a Tone, found 'x'"):
+        display(devices[Tier.fast], frame, EXPOSURE_S, "x")
 
 
 def test_what_a_device_cannot_do_is_refused(restorers: dict[Tier, Restorer]) -> None:

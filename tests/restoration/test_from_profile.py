@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import subprocess
 import sys
@@ -62,6 +63,12 @@ def test_a_frame_darker_than_the_panels_light_is_refused(profile: Profile, tmp_p
         assert (tmp_path / "out").exists() is (status == 0)
         if status:
             assert "Expected a frame at least as bright as the panel's own light" in json.loads(done.stdout)["error"]
+
+
+def test_a_folder_to_keep_that_is_no_path_is_refused(profile: Profile) -> None:
+    made = inspect.unwrap(Restorer.from_profile.__func__)  # programs do not have the tests' own check of types
+    with pytest.raises(RestorationError, match="the path of a folder that keeps what is computed, found 5"):
+        made(Restorer, profile, Tier.preview, keep=5)
 
 
 def test_absent_terms_cost_nothing(profile: Profile) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.special import erfcx
 
-# Variance of a colour's deviation from grey over the square of the grey: as in the filter's prior.
-COLOURFUL = 0.2
+from udccal.restoration.scene_prior import COLOURFUL
+
 # Pixels across, of which the smooth picture has one.
 STEP = 16
 # Where no deviation is wrong by more than this part, nothing is changed.

@@ -108,7 +108,7 @@ class Preview:
         raw = without_defects(self.blind.mended(raw, exposure_s), self.noise, exposure_s, self.cfa)
         signal = above_dark_DN(raw, self.noise, exposure_s)
         signal *= self.gain
-        scale = tone.scale() / np.float32(exposure_s)
+        scale = tone.of_electrons(exposure_s).scale()
         if self.mask is None:
             codes = _codes(signal, None, self.channels, np.zeros(3, np.float32), scale)
         else:

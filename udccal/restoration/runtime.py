@@ -7,13 +7,14 @@ Units: a restored picture is linear light in e-/s of each camera colour, on the 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
+from udccal.arguments import check_is_path, check_kind
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.kernels import fitted_size
@@ -37,7 +38,7 @@ from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
 from udccal.restoration.stages import Stage
-from udccal.restoration.tone import Tone
+from udccal.restoration.tone import TONE_ADVICE, Tone
 from udccal.restoration.view import kept_view
 from udccal.rig import RigDescription
 from udccal.tiers import Tier, tier_named
@@ -142,9 +143,11 @@ class Restorer:
 
         Raises:
             RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
-                finite, there is no such tier, or options are no ``PlanOptions``.
+                finite, there is no such tier, options are no ``PlanOptions``, or ``keep`` is no path.
         """
         check_profile(profile)
+        if keep is not None:
+            check_is_path(keep, "a folder that keeps what is computed", RestorationError)
         options, tier, keep = checked_options(options), tier_named(tier), None if keep is None else Path(keep)
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
@@ -294,11 +297,9 @@ class Restorer:
             RestorationError: as ``restore``.
         """
         check_exposure(exposure_s)
-        if not isinstance(tone, Tone):
-            raise RestorationError(f"Expected a Tone, found {tone!r:.80}. Give Tone(display_exposure(picture)), say.")
+        check_kind(tone, Tone, TONE_ADVICE, RestorationError)
         if self.tier is not Tier.preview:
-            of_e = replace(tone, exposure=tone.exposure / exposure_s)
-            return of_e.rgb8(self._restored_e(mosaic, exposure_s, panel_picture))
+            return tone.of_electrons(exposure_s).rgb8(self._restored_e(mosaic, exposure_s, panel_picture))
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
         return self._preview.rgb8(mosaic, exposure_s, tone)

@@ -41,20 +41,11 @@ class Solved:
     """What the tiles' filters give.
 
     Attributes:
+        tiles: of the signal, with their clipped samples completed.
         picture: in e-, of the rows that the layout covers.
         strengths: of each tile's prior, in units of its noise.
         noise_e: sigma of a sample of each colour, by tile.
     """
-
-    picture: Strip
-    strengths: Float32[np.ndarray, " tiles"]
-    noise_e: Float32[np.ndarray, "tiles 3"]
-
-
-@final
-@dataclass(frozen=True)
-class _Filtered:
-    """What ``Solved`` has, and the tiles with their clipped samples completed."""
 
     tiles: list[Float32[np.ndarray, "tile_rows tile_columns"]]
     picture: Strip
@@ -136,7 +127,7 @@ class Sharpener:
         Returns:
             the picture in e-, of the rows that the layout covers.
         """
-        found = self._filtered(signal_e, variance_e2, clipped)
+        found = self.solved(signal_e, variance_e2, clipped)
         if self.noise is None:
             return found.picture
         bands = self.noise.of_tiles(found.strengths)
@@ -148,16 +139,12 @@ class Sharpener:
         best = refined(balanced, found.picture, self._sharper(found), *given)
         return best + self._contradicted(best, signal_e, clipped, found.noise_e)
 
-    def solved(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Solved:
-        """Demosaic and deblur as ``apply`` does, but take out no noise."""
-        found = self._filtered(signal_e, variance_e2, clipped)
-        return Solved(found.picture, found.strengths, found.noise_e)
-
     @property
     def _given(self) -> tuple[FilterTables, TileLayout, Cfa, int]:
         return self.tables, self.layout, self.cfa, self.options.workers
 
-    def _filtered(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> _Filtered:
+    def solved(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Solved:
+        """Demosaic and deblur as ``apply`` does, but take out no noise."""
         noise_e = self._tile_noise(variance_e2)
         tiles = self.layout.tiles(signal_e)
         at, missing = clipped_tiles(clipped, self.layout)
@@ -171,9 +158,9 @@ class Sharpener:
             with ThreadPoolExecutor(self.options.workers) as pool:
                 for index, tile in zip(at, pool.map(whole, at.tolist(), missing), strict=True):
                     tiles[index] = tile
-        return _Filtered(tiles, *filtered_and_joined(tiles, noise_e, *self._given), noise_e)
+        return Solved(tiles, *filtered_and_joined(tiles, noise_e, *self._given), noise_e)
 
-    def _sharper(self, found: _Filtered) -> Strip:
+    def _sharper(self, found: Solved) -> Strip:
         """Filter again, with a stronger prior than the one that each tile chose."""
         return filtered_and_joined(found.tiles, found.noise_e, *self._given, sharper(found.strengths))[0]
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, UInt8
 
 from udccal.arguments import check_number
 from udccal.errors import RestorationError
 
 # A still picture's exposure brings this percentile of its light to this display-encoded value.
 PERCENTILE, LEVEL = 97.0, 0.9
+_MOST = 1e30
+TONE_ADVICE = "Give Tone(display_exposure(picture)), say."
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Tone:
         check_number(
             self.exposure,
             "an exposure of the display",
-            (0.0, 1e30),
+            (0.0, _MOST),
             "Try display_exposure of a picture.",
             RestorationError,
         )
@@ -46,6 +48,10 @@ class Tone:
             check_number(
                 gain, "a gain of a colour", (0.0, 1e6), "A gain of 1 leaves the colour as it is.", RestorationError
             )
+
+    def of_electrons(self, exposure_s: float) -> Tone:
+        """Return the tone that shows a frame's e- as this one shows its e-/s."""
+        return replace(self, exposure=min(self.exposure / exposure_s, _MOST))
 
     def scale(self) -> Float32[np.ndarray, "3"]:
         """Return the factor of each colour from linear light to the display's range."""
@@ -85,11 +91,6 @@ def display_exposure(linear: Float[np.ndarray, "rows columns 3"], least: float =
 def to_rgb8(display: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
     """Convert ``display``-encoded values, clipped to 0-1, to 8 bit."""
     return np.rint(np.clip(display, 0.0, 1.0) * 255.0).astype(np.uint8)
-
-
-def to_rgb16(display: Float[np.ndarray, "rows columns 3"]) -> UInt16[np.ndarray, "rows columns 3"]:
-    """Convert ``display``-encoded values, clipped to 0-1, to 16 bit."""
-    return np.rint(np.clip(display, 0.0, 1.0) * 65535.0).astype(np.uint16)
 
 
 # 8-bit sRGB codes of 65536 even steps of linear light from 0 to 1.

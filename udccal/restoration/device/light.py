@@ -13,11 +13,12 @@ from jaxtyping import Array, Bool, Float, Int, UInt8, UInt16
 from udccal.cfa import Cfa
 from udccal.models.noise import Noise, linear_signal
 from udccal.restoration.backscatter import SPARSE
-from udccal.restoration.dark_places import COLOURFUL, LEAST_E, NEGLIGIBLE, STEP
+from udccal.restoration.dark_places import LEAST_E, NEGLIGIBLE, STEP
 from udccal.restoration.defects import OUTLIER_RATIO, OUTLIER_SIGMA
 from udccal.restoration.device.planes import Mosaic, apart, box_mean, resized, together
 from udccal.restoration.mosaic_filter import channels_of
 from udccal.restoration.panel_mask import BLOCK, PERCENTILE, SIGMAS, STRIPS
+from udccal.restoration.scene_prior import COLOURFUL
 
 _AROUND = tuple((down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1))
 

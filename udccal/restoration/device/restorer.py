@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import final
 
 import equinox as eqx
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8, UInt16
 
+from udccal.arguments import check_kind
 from udccal.errors import RestorationError
 from udccal.restoration.backscatter import refuse_excess_of
 from udccal.restoration.checks import check_frame, check_panel_picture
@@ -26,7 +27,7 @@ from udccal.restoration.rectify import interpolation_taps
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.scene_prior import STRENGTHS
 from udccal.restoration.sharpen import LOCAL_PX
-from udccal.restoration.tone import CODES, Tone
+from udccal.restoration.tone import CODES, TONE_ADVICE, Tone
 from udccal.tiers import Tier
 
 PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
@@ -169,6 +170,7 @@ class DeviceRestorer:
         """Restore a frame for a display as ``Restorer.display`` does; arguments and errors are the same."""
         check_frame(mosaic, exposure_s, self.restorer.rig)
         check_panel_picture(panel_picture, self.restorer.rig)
+        check_kind(tone, Tone, TONE_ADVICE, RestorationError)
         noise, panel = self.restorer.noise, self.restorer.panel
         known = panel_picture is not None and panel is not None
         # A panel that stands still costs a comparison.
@@ -178,7 +180,7 @@ class DeviceRestorer:
                 self.latest = seen.copy()
                 self.rate = self.panel.rate(jax.device_put(self.latest, self.rate.device))
         exposed = np.array([exposure_s, dark_DN(noise, exposure_s), variance_floor_e2(noise, exposure_s)], np.float32)
-        scale = replace(tone, exposure=tone.exposure / exposure_s).scale()
+        scale = tone.of_electrons(exposure_s).scale()
         rows = self.restorer.blind.mended(mosaic[self.restorer.rows], exposure_s)
         given = rows, scale, exposed, np.bool_(known)
         shown, excess = jax.device_get(self.stages.shown(*jax.device_put(given, self.rate.device), self.rate))
