@@ -7,14 +7,21 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 import typer
+from typer.main import get_command
 
+from udccal.cli.app import app
 from udccal.cli.bench_options import BenchOptions, CameraKind, DisplayKind
 from udccal.cli.jobs.simulate import simulate_files
 from udccal.cli.output import Output
+from udccal.cli.run import run
 from udccal.errors import UdccalError
+from udccal.io.png import write_rgb8
 
 PORTRAIT = str(Path(__file__).resolve().parents[2] / "udccal" / "data" / "portrait.jpg")
 
@@ -139,6 +146,47 @@ def test_photographs_of_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UdccalError, match=r"a-mosaic\.png for .*a\.jpeg is taken by"):
         simulate_files(Output(), pictures, "lg55-reduced", tmp_path / "out", None, 0)
     assert not (tmp_path / "out").exists()
+
+
+def test_photographs_are_read_before_any_is_simulated(tmp_path: Path) -> None:
+    write_rgb8(tmp_path / "good.png", np.full((8, 8, 3), 90, np.uint8))
+    (tmp_path / "bad.png").write_text("no picture")
+    pictures = [tmp_path / "good.png", tmp_path / "bad.png"]
+    with pytest.raises(UdccalError, match=r"bad\.png"):
+        simulate_files(Output(), pictures, "lg55-reduced", tmp_path / "out", None, 0)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "given"),
+    [
+        ("--serial", {"camera": CameraKind.files, "serial": "1"}),
+        ("--seed", {"camera": CameraKind.files, "seed": 0}),
+        ("--mirror-delay-ms", {"mirror_delay_ms": 25.0}),
+        ("--hook-ms", {"hook_ms": 10.0}),
+        ("--panel-picture", {"camera": CameraKind.u3v, "panel_picture": Path("a.png")}),
+    ],
+)
+def test_options_of_run_without_effect_are_wrong_words(option: str, given: dict[str, Any]) -> None:
+    with pytest.raises(typer.BadParameter, match="does nothing without") as refused:
+        run(MagicMock(spec=typer.Context), Path("p"), "shm:a", **given)
+    assert refused.value.param_hint == f"'{option}'"
+
+
+@pytest.mark.parametrize(
+    ("verb", "option", "value"),
+    [
+        ("restore", "--min-psnr", "nan"),
+        ("restore", "--min-psnr", "-1"),
+        ("restore", "--exposure-s", "inf"),
+        ("run", "--exposure-s", "inf"),
+    ],
+)
+def test_numbers_that_are_none_are_wrong_words(verb: str, option: str, value: str) -> None:
+    command = vars(get_command(app))["commands"][verb]
+    (parameter,) = (each for each in command.params if option in each.opts)
+    with pytest.raises(typer.BadParameter):
+        parameter.process_value(command.context_class(command), value)
 
 
 def test_an_export_needs_a_name() -> None:

@@ -19,12 +19,13 @@ from udccal.cli.output import Output
 from udccal.cli.restore import TierChoice, restore
 from udccal.errors import FileFormatError, RestorationError
 from udccal.io.png import write_png16, write_rgb8
-from udccal.profiles.profile import Profile
+from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.store import write_profile
 from udccal.restoration import planner
 from udccal.restoration.frame_time import PartTimes
 from udccal.restoration.scene_plan import Wish
 from udccal.result import FitStatus
+from udccal.rig import load_rig
 from udccal.tiers import Tier
 
 TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 1e-6, 2e-8, 1e-8, 3e-7, 1e-7)))
@@ -99,6 +100,30 @@ def test_without_a_wish_it_restores_at_the_most_accurate_tier(folder: Path, caps
     assert json.loads(capsys.readouterr().out)["tier"] == "balanced"
 
 
+def test_a_folder_that_holds_a_profile_is_refused(folder: Path) -> None:
+    """An image called wire_map would overwrite the profile's own with --format exr."""
+    (folder / "frame.png").rename(folder / "wire_map.png")
+    given = replace(frames(folder), images=[folder / "wire_map.png"])
+    before = {file: file.read_bytes() for file in (folder / "profile").iterdir()}
+    with pytest.raises(RestorationError, match=r"profile holds profile\.json"):
+        restore_files(Output(), given, Plans(Tier.preview, None), folder / "profile", "exr")
+    assert {file: file.read_bytes() for file in (folder / "profile").iterdir()} == before
+
+
+@pytest.mark.medium
+def test_what_was_written_before_a_frame_that_is_refused_is_told(folder: Path, profile: Profile) -> None:
+    rig = profile.rig.model_copy(update={"panel": load_rig("lg55-reduced").panel})
+    lit = build_profile(rig, profile.provenance, *profile.results, profile.wire_map)
+    write_profile(folder / "lit", replace(lit, psf=replace(lit.psf, status=FitStatus.ABSENT)))
+    write_rgb8(folder / "white.png", np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8))
+    write_png16(folder / "dark.png", np.full((rig.camera.rows, rig.camera.columns), 64, np.uint16))
+    images = [folder / "frame.png", folder / "dark.png"]
+    given = Frames(images, folder / "lit", folder / "white.png", float(200 / lit.backscatter_mask.mean()))
+    with pytest.raises(RestorationError, match=r"dark\.png: .* Written before: .*frame\.png"):
+        restore_files(Output(), given, Plans(Tier.fast, None), folder / "out", "png")
+    assert [file.name for file in (folder / "out").iterdir()] == ["frame.png"]
+
+
 @pytest.mark.parametrize("name", ["frame.png", "shown.png"])
 def test_no_picture_that_was_given_is_overwritten(folder: Path, name: str) -> None:
     (folder / "raw").mkdir()
@@ -141,6 +166,7 @@ def test_what_does_not_belong_to_the_profile_is_refused_before_any_work(
         ({"out": Path("o"), "tier": TierChoice.fast, "budget_ms": 5.0}, "takes neither another --tier nor --plan"),
         ({"out": Path("o"), "plan": Path("p"), "min_psnr": 30.0}, "takes neither another --tier nor --plan"),
         ({"out": Path("o"), "plan": Path("p"), "tier": TierChoice.fast}, "takes neither --tier nor --explain"),
+        ({"out": Path("o"), "plan": Path("p"), "tier": TierChoice.auto}, "takes neither --tier nor --explain"),
         ({"plan": Path("p"), "explain": True}, "takes neither --tier nor --explain"),
     ],
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,10 +13,12 @@ from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.errors import RestorationError
 from udccal.io.out_folder import check_writable, storing_in
+from udccal.profiles.provenance import PROFILE_NAME
 from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure
+from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.tiers import Tier
 
 
@@ -51,11 +55,16 @@ def restore_files(
     Raises:
         ProfileError: when the profile cannot be read.
         FileFormatError: when an image or the panel's picture cannot be read.
-        RestorationError: when an image or a plan does not fit the profile, an exposure is not known, or no tier does
-            what is asked.
+        RestorationError: when an image or a plan does not fit the profile, an exposure is not known, no tier does
+            what is asked, or ``out`` holds a profile or a session.
         UdccalError: when ``out`` cannot be written to; this is found before any work.
     """
     check_writable(out)
+    for name in (PROFILE_NAME, MANIFEST_NAME):
+        if (out / name).exists():
+            raise RestorationError(
+                f"Expected a folder for pictures, found that {out} holds {name}. Choose another folder."
+            )
     keep_compilations()
     targets = _targets(frames, out, picture_format)
     scene = read_scene(output, frames)
@@ -66,7 +75,7 @@ def restore_files(
         for index, (image, target) in enumerate(zip(frames.images, targets, strict=True)):
             stage.update(index, len(targets), f"restoring {image.name}")
             mosaic, exposure = scene.frame(image)
-            with naming(image):
+            with naming(image), _telling_of(restored):
                 picture = restorer.restore(mosaic, exposure, scene.shown)
             with storing_in(out):
                 out.mkdir(parents=True, exist_ok=True)
@@ -75,6 +84,16 @@ def restore_files(
     for item in restored:
         output.say(f"{item.source} -> {item.picture}")
     output.result(RestoreSummary(frames.profile, plan.tier, tuple(restored)))
+
+
+@contextmanager
+def _telling_of(restored: list[RestoredFile]) -> Iterator[None]:
+    """Add what was written before to what is wrong with a frame."""
+    try:
+        yield
+    except RestorationError as error:
+        written = f" Written before: {', '.join(str(file.picture) for file in restored)}." if restored else ""
+        raise RestorationError(f"{error}{written}") from error
 
 
 def _targets(frames: Frames, out: Path, picture_format: str) -> list[Path]:

@@ -59,7 +59,7 @@ def simulate_files(
 
     Raises:
         RigError: when the rig is not known.
-        FileFormatError: when a photograph or the panel's picture cannot be read.
+        FileFormatError: when a photograph or the panel's picture cannot be read; this is found before any work.
         UdccalError: when the results of two photographs would have one name, or the name of a photograph.
         UdccalError: when ``out`` cannot be written to; this is found before any work.
     """
@@ -67,6 +67,8 @@ def simulate_files(
     _check_names(images, out)
     rig = load_rig(rig_name)
     shown = None if panel_picture is None else read_panel_picture(panel_picture, rig)
+    for image in images:  # one after another, since all at once may not fit into memory
+        read_photograph(image)
     files: list[SimulatedFile] = []
     with output.stage("simulating") as stage:
         world = simulated_rig(rig, seed)
