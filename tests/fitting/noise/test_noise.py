@@ -232,8 +232,10 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     dark[3, 4] = dark[50, 60] = 90.0
     assert dsnu(dark, Quantity(0.09, 0.0), 0.0, RULES.defect_sigma, 1).places == ((3, 4), (50, 60))
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
-    assert codes.converter_step(frame) == 1
-    assert codes.converter_step(frame * np.uint16(16)) == 16
+    counts = np.bincount(frame.ravel())
+    assert codes.converter_step(counts) == 1
+    assert codes.converter_step(np.bincount(16 * frame.ravel())) == 16
+    assert codes.converter_step(counts, 1000) is None
 
 
 def test_the_posterior_gives_the_sigma_of_any_function_of_the_term(fitted: tuple[Sensor, FitResult[Noise]]) -> None:

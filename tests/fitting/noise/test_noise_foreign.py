@@ -186,6 +186,16 @@ def test_codes_that_never_occur_are_told(change: Callable[[np.ndarray, int], np.
     assert not noted(measure(SENSOR, 3), "never occur")
 
 
+def test_a_step_that_grows_with_the_signal_is_told() -> None:
+    """That of one bright frame was taken for all: the fit was refused, with advice on exposure times."""
+    result = fit_noise(changed(captured(SENSOR, 3), lambda codes, _: np.where(codes > 1000, codes // 2 * 2, codes)))
+    assert result.status is FitStatus.CONVERGED
+    assert noted(result, "Codes are 1 DN apart, but 2 DN in frames of")
+    for name, truth in (("K_DN_per_e", 0.36), ("black_DN", 64.0), ("q_DN", 1.0), ("sigma_d_e", 4.0)):
+        assert abs(result.estimate(name).value - truth) <= 4.5 * result.estimate(name).sigma, name
+    assert not noted(fit_noise(changed(captured(SENSOR, 3), lambda codes, _: codes // 2 * 2)), "DN apart")
+
+
 def test_saturation_is_that_of_full_pixels() -> None:
     """Of a flat that a lens shades by 30 % the corners are not full, and 0.06 DN were 10 sigma."""
     down, across = np.mgrid[: SHAPE[0], : SHAPE[1]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -240,6 +241,25 @@ FRAME = np.full((32, 32), 100, np.uint16)
 def test_what_is_no_frame_is_refused(levels: list[ExposureLevel], stack: SpatialStack | None, sentence: str) -> None:
     with pytest.raises(FitError, match=sentence):
         fit_noise(NoiseData(levels, stack, top_code=4095))
+
+
+def _unplugged() -> np.ndarray:
+    raise OSError("disk gone")
+
+
+def test_a_frame_that_cannot_be_loaded_is_named() -> None:
+    """The function's own error came through, which says nothing of the frame."""
+    levels = [ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME)), ExposureLevel(0.2, (FRAME, _unplugged), ())]
+    with pytest.raises(FitError, match=r"loads dark frame 1 of the pair of 0\.2 s, found OSError: disk gone"):
+        fit_noise(NoiseData(levels))
+
+
+@pytest.mark.parametrize(("arguments", "kind"), [((5, None), "Noise"), ((None, 5), "NoiseRules")])
+def test_arguments_of_another_kind_are_refused(arguments: tuple[Any, Any], kind: str) -> None:
+    """They ended in an AttributeError, or in the result."""
+    without_checks_of_types = inspect.unwrap(fit_noise)
+    with pytest.raises(FitError, match=f"Expected a {kind}, found 5"):
+        without_checks_of_types(NoiseData([]), *arguments)
 
 
 def test_an_exposure_that_is_a_frame_is_refused() -> None:

@@ -68,10 +68,13 @@ def _centres(edges_DN: Float[np.ndarray, " edges"], step_DN: float) -> Float[np.
     return np.asarray(0.5 * (edges[1:] + edges[:-1]))
 
 
-def converter_step(frame: Codes) -> int:
-    """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
-    codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
-    return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
+def converter_step(counts: Int[np.ndarray, " codes"], least: int = 3) -> int | None:
+    """Smallest step between the codes of a histogram: above 1 where a converter's bits are shifted up in 16 bits.
+
+    None where fewer than ``least`` different codes occur.
+    """
+    codes = np.flatnonzero(counts)
+    return int(np.gcd.reduce(np.diff(codes))) if codes.size >= least else None
 
 
 def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:

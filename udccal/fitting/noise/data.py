@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
 from udccal.arguments import check_count, check_number, found_instead
-from udccal.errors import FitError
+from udccal.errors import FitError, UdccalError
 from udccal.sessions.store import Session
 
 Codes = UInt16[np.ndarray, "rows columns"]
@@ -178,16 +178,25 @@ def _count(what: str, frames: object) -> int:
     return len(frames)
 
 
-def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
-    """A frame as codes; a FitError where it is not a picture of codes, or differs from ``shape``."""
-    array = frame() if callable(frame) else frame
+def loaded(frame: Frame, name: str, shape: tuple[int, ...] = ()) -> Codes:
+    """A frame as codes; a FitError where it is not a picture of codes, or differs from ``shape`` (empty: any).
+
+    ``name`` tells which frame it is, where a function that loads it fails.
+    """
+    try:
+        array = frame() if callable(frame) else frame
+    except UdccalError:
+        raise
+    except Exception as error:
+        found = f"found {type(error).__name__}: {error}"
+        raise FitError(f"Expected a function that loads {name}, {found}. Mend it, or give the array.") from error
     kind = array.dtype.newbyteorder("=") if isinstance(array, np.ndarray) else None
     if kind not in (np.uint8, np.uint16) or array.ndim != 2:
         expected = "Expected a frame as uint8 or uint16 array of rows x columns"
         raise FitError(f"{expected}, found {found_instead(array)}. Pass raw codes.")
     if min(array.shape) < _LEAST_SIDE or max(array.shape) > _MOST_SIDE:
         raise FitError(f"Expected frames of {_LEAST_SIDE} to {_MOST_SIDE} samples a side, found {array.shape}.")
-    if shape is not None and array.shape != shape:
+    if shape and array.shape != shape:
         raise FitError(f"Expected frames of {shape} samples, found {array.shape}. Sort the frames by sensor.")
     return array if array.dtype == np.uint16 else array.astype(np.uint16)
 

@@ -8,6 +8,8 @@ from itertools import compress
 import numpy as np
 from jaxtyping import Float
 
+from udccal.arguments import check_kind
+from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
@@ -54,9 +56,13 @@ def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules |
         the term with its status; a fit that is not possible says why in its notes.
 
     Raises:
-        FitError: when a frame is not a picture of codes like the others, or an exposure is not a time.
+        FitError: when an argument is of another kind, a frame is not a picture of codes like the others or cannot be
+            loaded, or an exposure is not a time.
         SessionError: when a file of the session is missing or damaged.
     """
+    for given, kind in ((nominal, Noise), (rules, NoiseRules)):
+        if given is not None:
+            check_kind(given, kind, "Leave it out for the default.", FitError)
     moments = reduced(data, rules or NoiseRules())
     nominal = nominal or _assumed(1.0, 0.0, moments.top_DN if moments else 4095.0)
     if moments:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import final
+from typing import Literal, final
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from udccal.arguments import check_kind
 from udccal.errors import FitError
 from udccal.fitting.noise.codes import DarkPair, converter_step, dark_pair
-from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack, loaded
+from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, NoiseData, NoiseRules, SpatialStack, loaded
 from udccal.fitting.noise.frame_moments import Moments, reduce_frames, stacked
 
 Grid = Float[np.ndarray, "levels bins"]
@@ -104,30 +104,39 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     if not darks or not brights:
         return None
     stack, period = data.stack, 2 if data.bayer else 1
-    sample = loaded(brights[len(brights) // 2].bright[0])
-    q_DN = converter_step(sample)
+
+    def codes(kind: Literal["dark", "bright"], of: ExposureLevel | SpatialStack) -> Iterator[Codes]:
+        whole = "stack" if of is stack else f"pair of {of.exposure_s:.4g} s"
+        for number, frame in enumerate(getattr(of, kind)):
+            yield loaded(frame, f"{kind} frame {number} of the {whole}", shape)
+
+    shape: tuple[int, ...] = ()
+    samples = [next(codes(*one)) for one in (("bright", brights[len(brights) // 2]), ("dark", darks[-1]))]
+    shape = samples[0].shape
+    # Converters with a step that grows with the signal show the smallest one in dark frames.
+    steps = (converter_step(np.bincount(sample.ravel())) for sample in samples)
+    q_DN = int(np.gcd.reduce([step for step in steps if step] or [1]))
     metered = all(level.photons is not None for level in brights) and (stack is None or stack.photons is not None)
 
-    def seen(frames: Iterable[Frame], of: ExposureLevel | SpatialStack, dark_step: int = 0) -> tuple[Averaged, Moments]:
-        codes, light = (loaded(frame, sample.shape) for frame in frames), of.photons if metered else None
-        return reduce_frames(codes, of.exposure_s, light, period, rules, dark_step)
+    def seen(frames: Iterable[Codes], of: ExposureLevel | SpatialStack, dark_step: int = 0) -> tuple[Averaged, Moments]:
+        return reduce_frames(frames, of.exposure_s, of.photons if metered else None, period, rules, dark_step)
 
     def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
-        first, second = (loaded(frame, sample.shape) for frame in level.dark)
+        first, second = codes("dark", level)
         _check_darker(first, level.exposure_s, flats)
         return dark_pair(first, second, level.exposure_s, q_DN, top), seen((first, second), level, q_DN)[1]
 
     def average(stack: SpatialStack, lit: bool) -> tuple[Averaged, Moments | None]:
         frames = stack.bright if lit else stack.dark
         if not isinstance(frames, Averaged):
-            return seen(frames, stack, 0 if lit else q_DN)
-        frames.check(sample.shape)
+            return seen(codes("bright" if lit else "dark", stack), stack, 0 if lit else q_DN)
+        frames.check(shape)
         return frames, None
 
     with ThreadPoolExecutor(2) as pool:
         # The stacks are the longest tasks: they go first.
         tasks = [pool.submit(average, stack, lit) for lit in (False, True)] if stack else []
-        flats = tuple(pool.map(lambda level: seen(level.bright, level)[1], brights))
+        flats = tuple(pool.map(lambda level: seen(codes("bright", level), level)[1], brights))
         peak = max(flat.peak_DN for flat in flats)
         possible = int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
         top = possible if data.top_code is None else data.top_code
@@ -140,7 +149,7 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         means = np.array([flat.mean_DN.mean() for flat in flats])
         middle = brights[int(np.argmin(np.abs(means - 0.5 * min(means.max(), top))))]
         near = min(darks, key=lambda level: abs(level.exposure_s - middle.exposure_s))
-        stacks = [(seen(near.dark, near)[0], None), (seen(middle.bright, middle)[0], None)]
+        stacks = [(seen(codes("dark", near), near)[0], None), (seen(codes("bright", middle), middle)[0], None)]
     (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
     frames = histograms, dark_moments, flats, dark_stack, flat_stack
     return NoiseMoments(*frames, q_DN, float(top), period, dark_seen, flat_seen, rules)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udccal.fitting.engine.robust import outliers
+from udccal.fitting.noise.codes import converter_step
 from udccal.fitting.noise.flats import Curve
 from udccal.fitting.noise.frame_moments import MIDDLE_ROWS, Picture, Shared
 from udccal.fitting.noise.moments import NoiseMoments
@@ -60,6 +61,7 @@ def notes(
             "the converter's steps are uneven, and noise of a few codes, black and saturation are those of its codes"
         )
         yield f"{found}: {cause}."
+    yield from _of_steps(data)
     if (test := curve.fit.misfit).found:
         found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
         yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
@@ -100,6 +102,14 @@ def _of_darks(data: NoiseMoments, dark: DarkTerms) -> Iterator[str]:
         yield f"{found}: {without} of the others."
         if not dark.white:
             yield "PRNU1288 is what is left without that DSNU: offsets of hot pixels, which rounding hides, are in it."
+
+
+def _of_steps(data: NoiseMoments) -> Iterator[str]:
+    """A sentence where the codes of some frames are further apart than the converter's step."""
+    steps = [(converter_step(of.codes, 8) or data.q_DN, of.level_DN) for of in (*data.flats, *data.dark_moments)]
+    if coarse := [level for step, level in steps if step > data.q_DN]:
+        found = f"Codes are {data.q_DN} DN apart, but {max(steps)[0]} DN in frames of {min(coarse):.4g} DN and others"
+        yield f"{found}: the converter's step is not the same at all signals, and q_DN is the smallest."
 
 
 def _missing_codes(data: NoiseMoments) -> Int[np.ndarray, " missing"]:
