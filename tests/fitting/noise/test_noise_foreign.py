@@ -186,6 +186,23 @@ def test_codes_that_never_occur_are_told(change: Callable[[np.ndarray, int], np.
     assert not noted(measure(SENSOR, 3), "never occur")
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_a_response_that_saturates_softly_is_told_where_it_begins_to(seed: int) -> None:
+    """The bright flats were outliers, and K was up to 7 sigma too small by the next ones."""
+
+    def soft(codes: np.ndarray, _: int) -> np.ndarray:
+        part = (codes - 64) / 3600
+        return np.rint(64 + 3600 * np.where(part < 0.6, part, 0.6 + 0.4 * np.tanh((part - 0.6) / 0.4))).astype(int)
+
+    sensor = replace(SENSOR, levels=(0.05, 0.15, 0.25, 0.35, 0.45, 0.6, 0.75, 1.4), stack_level=0.63, stack_frames=24)
+    data = captured(sensor, seed)
+    result = fit_noise(changed(data, soft))
+    assert noted(result, "All variances of flat 6")
+    for name, truth in (("K_DN_per_e", 0.36), ("sigma_d_e", 4.0)):
+        assert abs(z(result, name, truth)) < 3.0, name
+    assert not noted(fit_noise(data), "All variances")
+
+
 def test_a_step_that_grows_with_the_signal_is_told() -> None:
     """That of one bright frame was taken for all: the fit was refused, with advice on exposure times."""
     result = fit_noise(changed(captured(SENSOR, 3), lambda codes, _: np.where(codes > 1000, codes // 2 * 2, codes)))

@@ -16,11 +16,12 @@ from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.noise.codes import Five, start_values
 from udccal.fitting.noise.dark import fit_dark_terms, unlike_exposures
 from udccal.fitting.noise.data import NoiseData, NoiseRules
-from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, shared_by_neighbours
+from udccal.fitting.noise.flats import Curve, fit_curve, shared_by_neighbours
 from udccal.fitting.noise.frame_moments import bins, stacked
 from udccal.fitting.noise.moments import NoiseMoments, contradiction, reduced, rough_gain
 from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import DarkTerms, Pattern, prnu, rough_median
+from udccal.fitting.noise.saturation import find_saturation
 from udccal.models.noise import Noise, linear_signal
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus

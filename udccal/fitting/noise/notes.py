@@ -16,9 +16,12 @@ from udccal.fitting.noise.patterns import DarkTerms, Pattern, rough_median
 from udccal.result import Outliers
 
 
+_PRNU_BY_CURVE = "PRNU1288 holds for the photon transfer curve as fitted, which the variances do not follow."
+
+
 def left_out(data: NoiseMoments, dark: DarkTerms, curve: Curve, uneven: Pattern, end_DN: float) -> Iterator[Outliers]:
     """Samples that are left out, by rule; some of these are empty. ``end_DN`` is saturation."""
-    names = [*(f"flat {i} ({flat.exposure_s:.4g} s)" for i, flat in enumerate(data.flats)), "flat stack"]
+    names = _names(data)
     # Unclipped samples stand out among clipped ones; that is no defect.
     ceiling = end_DN - 0.1 * (curve.ceiling_DN - dark.black_DN)
     seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
@@ -33,6 +36,10 @@ def left_out(data: NoiseMoments, dark: DarkTerms, curve: Curve, uneven: Pattern,
         places = tuple(f"row {row}, column {column}" for row, column in found.places)
         rule = f"averaged {what} pixels {data.rules.defect_sigma:g} robust sigma off {beside}"
         yield Outliers(rule, found.outliers, places)
+
+
+def _names(data: NoiseMoments) -> list[str]:
+    return [*(f"flat {i} ({flat.exposure_s:.4g} s)" for i, flat in enumerate(data.flats)), "flat stack"]
 
 
 def notes(
@@ -65,7 +72,13 @@ def notes(
     if (test := curve.fit.misfit).found:
         found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
         yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
-        yield "PRNU1288 holds for the photon transfer curve as fitted, which the variances do not follow."
+        yield _PRNU_BY_CURVE
+    if (end := curve.off_its_end) is not None:
+        found = (
+            f"All variances of {_names(data)[end]}, the brightest inside the range, are off the photon transfer curve"
+        )
+        yield f"{found}: the response bends there. The sigmas include by how much dimmer flats differ from the others."
+        yield _PRNU_BY_CURVE
     if shared.found:
         found = f"(correlation {shared.along_row:.2g} along rows, {shared.along_column:.2g} along columns)"
         yield (
