@@ -22,6 +22,7 @@ from udccal.fitting.noise.moments import NoiseMoments, contradiction, reduced, r
 from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import DarkTerms, Pattern, prnu, rough_median
 from udccal.fitting.noise.saturation import find_saturation
+from udccal.fitting.noise.transfer import temporal_variance
 from udccal.models.noise import Noise, linear_signal
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus
@@ -156,7 +157,7 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[FitStat
 
 def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> Pattern:
     """PRNU from the stacks; the photon transfer curve gives the temporal variance of the averages."""
-    K, V0, c = curve.values[:3].tolist()
+    K, V0, c, *_, gain_noise2 = curve.values.tolist()
     bright, stack, rate = data.flat_stack, data.dark_stack, dark.dark_DN_per_s.value
     quiet = max(V0, 0.0) + data.rounding_DN2
     at_no_light = (quiet + K * rate * bright.exposure_s) / bright.frames
@@ -170,7 +171,8 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> Patter
     level = max(rough_median(signal), 1e-6)
     z = float(linear_signal(np.array(level), c, K))
     steep = 1 - 2 * c * z
-    found = prnu(signal, at_no_light, K * z * steep**2 / level / bright.frames, data.period, data.rules.defect_sigma)
+    shot = temporal_variance(z, K, 0.0, c, 0.0, gain_noise2) / level / bright.frames
+    found = prnu(signal, at_no_light, shot, data.period, data.rules.defect_sigma)
     # Where the response bends, a relative change of light is a smaller relative change of signal.
     scale = (level / (z * steep)) ** 2
     offsets = 0.0 if dark.white else float(np.sqrt(dark.dsnu_DN2.variance)) / level**2
@@ -215,6 +217,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
             Diagnostic("response_DN_per_light", float(fit.values[3]), "DN"),
             Diagnostic("light_offset", float(fit.values[4]), "light"),
             Diagnostic("light_scatter", fit.scatter, "1"),
+            Diagnostic("gain_noise", float(fit.values[5]) ** 0.5, "1"),
             Diagnostic("flat_structure", uneven.structure2**0.5, "1"),
             Diagnostic("dark_samples_outside_histogram", float(outside), "1"),
             Diagnostic("edge_gain", float(np.sqrt(np.mean(dark.fit.edge_gains**2))), "1"),

@@ -14,7 +14,7 @@ from udccal.fitting.noise.codes import excess_kurtosis
 from udccal.fitting.noise.frame_moments import Shared, stacked
 from udccal.fitting.noise.moments import NoiseMoments, steadied
 from udccal.fitting.noise.patterns import DarkTerms
-from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
+from udccal.fitting.noise.transfer import DarkVariance, Levels, Six, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]
 
@@ -37,7 +37,7 @@ class Curve:
     inside: Levels
     levels: Levels
     choice: Choice[TransferFit] | None
-    apart: Five = field(default_factory=lambda: np.zeros(5))
+    apart: Six = field(default_factory=lambda: np.zeros(6))
 
     @property
     def fit(self) -> TransferFit:
@@ -46,12 +46,12 @@ class Curve:
         return self.choice.best.fit
 
     @property
-    def values(self) -> Five:
+    def values(self) -> Six:
         """The fit's values; zeros where there is none."""
-        return np.zeros(5) if self.choice is None else self.fit.values
+        return np.zeros(6) if self.choice is None else self.fit.values
 
     @property
-    def cov(self) -> Float[np.ndarray, "5 5"]:
+    def cov(self) -> Float[np.ndarray, "6 6"]:
         """Covariance of the values, with what the variances' misfit and the choice of an order add."""
         assert self.choice is not None, "asked for where there are usable levels"
         orders = self.choice.spread(self.fit.samples, lambda of: of.values)

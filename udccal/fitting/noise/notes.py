@@ -15,7 +15,6 @@ from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import DarkTerms, Pattern, rough_median
 from udccal.result import Outliers
 
-
 _PRNU_BY_CURVE = "PRNU1288 holds for the photon transfer curve as fitted, which the variances do not follow."
 
 
@@ -73,6 +72,9 @@ def notes(
         found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
         yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
         yield _PRNU_BY_CURVE
+    if curve.fit.order.gain_noise:
+        found = f"Pixels have noise of {100 * curve.values[5] ** 0.5:.2g} % of their signal beside shot noise"
+        yield f"{found}: K is that of small signals, and the noise of bright ones is more than the term says."
     if (end := curve.off_its_end) is not None:
         found = (
             f"All variances of {_names(data)[end]}, the brightest inside the range, are off the photon transfer curve"

@@ -2,9 +2,10 @@
 
 The sensor turns a linear signal z (DN above black) into y = z - c (z^2 + K z): c is 0 for a linear one. Then
 
-    temporal variance = K z (1 - 2 c z)^2 + V0 + q^2/12,     light part of z = A (u + u0),
+    temporal variance = (K z + g^2 z^2) (1 - 2 c z)^2 + V0 + q^2/12,     light part of z = A (u + u0),
 
-with u the relative exposure to light. Sample variances are chi-squared: their weights come from the model, not from the
+with u the relative exposure to light. The gain noise g, 0 of most sensors, is noise in proportion to a pixel's signal
+that is new in every frame. Sample variances are chi-squared: their weights come from the model, not from the
 data. Both relations determine c; where the light is unsteady, which is one of the orders, only the first does.
 """
 
@@ -27,8 +28,12 @@ from udccal.models.noise import linear_signal
 Grid = Float[np.ndarray, "levels bins"]
 PerLevel = Float[np.ndarray, " levels"]
 PerDatum = Float[np.ndarray, " data"]
-# K [DN/e], V0 [DN^2], curvature [1/DN], response [DN per light], offset of the light.
-Five = Float[np.ndarray, "5"]
+# K [DN/e], V0 [DN^2], curvature [1/DN], response [DN per light], offset of the light, square of the gain noise.
+Six = Float[np.ndarray, "6"]
+
+
+# Gain noise of fewer sigma is no candidate.
+_LEAST_GAIN_NOISE = 2.0
 
 
 @final
@@ -76,22 +81,23 @@ class DarkVariance:
 @final
 @dataclass(frozen=True)
 class Order:
-    """Which parts of the model are free: curvature, offset of the exposures, light that differs by level."""
+    """Which parts are free: curvature, offset of the exposures, light that differs by level, gain noise."""
 
     curved: bool = False
     offset: bool = False
     unsteady: bool = False
+    gain_noise: bool = False
 
     @property
     def name(self) -> str:
         """For the table of candidates."""
         offset, unsteady = ", exposure offset" * self.offset, ", unsteady light" * self.unsteady
-        return f"response: {'curved' if self.curved else 'linear'}{offset}{unsteady}"
+        return f"response: {'curved' if self.curved else 'linear'}{offset}{unsteady}{', gain noise' * self.gain_noise}"
 
     @property
-    def free(self) -> Bool[np.ndarray, "5"]:
-        """Which of the five parameters."""
-        return np.array([True, True, self.curved, True, self.offset])
+    def free(self) -> Bool[np.ndarray, "6"]:
+        """Which of the six parameters."""
+        return np.array([True, True, self.curved, True, self.offset, self.gain_noise])
 
 
 @final
@@ -103,8 +109,8 @@ class TransferFit:
     """
 
     order: Order
-    values: Five
-    cov: Float[np.ndarray, "5 5"]
+    values: Six
+    cov: Float[np.ndarray, "6 6"]
     scatter: float
     converged: bool
     variance_z: Grid
@@ -113,12 +119,13 @@ class TransferFit:
     samples: int
 
 
-def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_DN2):  # type: ignore[no-untyped-def]
-    """K z (1 - 2 c z)^2 + V0 + rounding in DN^2 (EMVA 1288, clause 6), for a linear signal z above black.
+def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_DN2, gain_noise2=0.0):  # type: ignore[no-untyped-def]
+    """(K z + g^2 z^2) (1 - 2 c z)^2 + V0 + rounding in DN^2 (EMVA 1288, clause 6), for a linear signal z above black.
 
     Arguments and result are numpy or JAX arrays; the curvature c is 0 for a linear response, the rounding q^2 / 12.
     """
-    return K_DN_per_e * signal_DN * (1 - 2 * curvature_per_DN * signal_DN) ** 2 + V0_DN2 + rounding_DN2
+    light = (K_DN_per_e + gain_noise2 * signal_DN) * signal_DN
+    return light * (1 - 2 * curvature_per_DN * signal_DN) ** 2 + V0_DN2 + rounding_DN2
 
 
 @final
@@ -134,7 +141,7 @@ class TransferProblem:
     dark: DarkVariance
     order: Order
     bound: float
-    sizes: Five
+    sizes: Six
     name: str = "noise, photon transfer"
 
     @property
@@ -143,14 +150,15 @@ class TransferProblem:
         lacking = np.zeros(int(self.levels.responding.sum()))
         return np.concatenate([self.levels.variance_DN2[self.levels.usable], self.dark.V0_DN2, lacking])
 
-    def predicted(self, x: Five) -> PerDatum:
+    def predicted(self, x: Six) -> PerDatum:
         """The data by the model."""
-        K, V0, c, gain, offset = x
+        K, V0, c, gain, offset, noise2 = x
         levels, dark = self.levels, self.dark
         with np.errstate(divide="ignore", invalid="ignore"):
             signal = np.nan_to_num(linear_signal(np.where(levels.usable, levels.mean_DN, 0.0), c, K), posinf=0.0)
-            variance = np.maximum(temporal_variance(signal[levels.usable], K, V0, c, dark.rounding_DN2), 1e-9)
+            variance = temporal_variance(signal[levels.usable], K, V0, c, dark.rounding_DN2, noise2)
             bright = _brightness(signal - levels.dark_DN[:, None], levels.usable) / (gain * (levels.light + offset))
+        variance = np.maximum(variance, 1e-9)
         return np.concatenate([variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, (1 - bright)[levels.responding]])
 
     def variances(self, predicted: PerDatum) -> tuple[PerDatum, float]:
@@ -164,15 +172,15 @@ class TransferProblem:
         own = excess_variance(lacking**2, known, np.ones(len(known)))[0] if self.order.unsteady else 0.0
         return np.concatenate([2 * predicted[:bins] ** 2 / of.dof[use], self.dark.sigma_DN2**2, known + own]), own
 
-    def equations_at(self, place: Five) -> Blocks:
+    def equations_at(self, place: Six) -> Blocks:
         """Score and Fisher information; the scatter of the light is the maximum-likelihood one at this place."""
         predicted, dof, seen = self.predicted(place), self.levels.dof[self.levels.usable], self.levels.responding.sum()
         variances, _ = self.variances(predicted)
-        off, bins, jacobian = self.observed - predicted, len(dof), np.zeros((len(predicted), 5))
+        off, bins, jacobian = self.observed - predicted, len(dof), np.zeros((len(predicted), 6))
         # Free parameters are those of the order that the data determine.
-        free = self.order.free & ((np.arange(5) < 3) | (seen > 0))
+        free = self.order.free & np.array([True, True, True, seen > 0, seen > 0, True])
         for i in np.flatnonzero(free):
-            step = 1e-4 * self.sizes[i] * np.eye(5)[i]
+            step = 1e-4 * self.sizes[i] * np.eye(6)[i]
             jacobian[:, i] = (self.predicted(place + step) - self.predicted(place - step)) / (2 * step[i])
         ratio = np.maximum(self.observed[:bins] / predicted[:bins], 1e-12)
         cost = float(np.sum(dof * (ratio - 1 - np.log(ratio))) + np.sum(np.log(variances[len(off) - seen :])))
@@ -180,14 +188,15 @@ class TransferProblem:
         score, information = jacobian.T @ (off / variances), jacobian.T @ (jacobian / variances[:, None])
         held = ~free
         held[2] |= abs(place[2]) >= self.bound and score[2] * place[2] > 0
+        held[5] |= place[5] <= 0 and score[5] < 0
         return replace(Blocks.dense(cost, len(off), information, score), held=held)
 
-    def moved(self, place: Five, step: Step) -> Five:
-        """The place after a step, with the curvature inside its bound."""
-        most = np.array([np.inf, np.inf, self.bound, np.inf, np.inf])
-        return np.clip(place + step.shared, -most, most)
+    def moved(self, place: Six, step: Step) -> Six:
+        """The place after a step, with the curvature inside its bound and no negative square."""
+        most = np.array([np.inf, np.inf, self.bound, np.inf, np.inf, np.inf])
+        return np.clip(place + step.shared, [*-most[:5], 0.0], most)
 
-    def attempt(self, start: Five) -> Attempt[TransferFit]:
+    def attempt(self, start: Six) -> Attempt[TransferFit]:
         """The fit of the order."""
         order, use, samples = self.order, self.levels.usable, int(self.levels.dof[self.levels.usable].sum())
         found = minimise(self, np.where(order.free, start, 0.0))
@@ -197,8 +206,10 @@ class TransferProblem:
         variance_z, level_z = np.full(use.shape, np.nan), np.full(len(use), np.nan)
         variance_z[use], level_z[self.levels.responding] = z[:bins], np.nan_to_num(z[bins + len(self.dark.V0_DN2) :])
         misfit = chi2_test(float(np.sum(z[:bins] ** 2)), max(bins - 1.0, 1.0))
-        parameters, cov = order.curved + order.offset + order.unsteady, found.with_rest(found.equations.cov())
-        criterion = bic(found.equations.cost, float(parameters), samples) if found.converged else np.inf
+        parameters, cov = int(order.free.sum()) - 3 + order.unsteady, found.with_rest(found.equations.cov())
+        # A small gain noise is as good as none, and K far less certain beside it.
+        seen = not order.gain_noise or found.place[5] > _LEAST_GAIN_NOISE * cov[5, 5] ** 0.5
+        criterion = bic(found.equations.cost, float(parameters), samples) if found.converged and seen else np.inf
         numbers, residuals = (found.place, cov, float(np.sqrt(own)), found.converged), (variance_z, level_z)
         fit = TransferFit(order, *numbers, *residuals, misfit, samples)
         return Attempt(order.name, parameters, criterion, fit)
@@ -226,7 +237,7 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
     shot = levels.variance_DN2[use] - V0 - dark.rounding_DN2
     K = float(np.median(shot / np.maximum(levels.mean_DN[use], 1e-9)))
     gain = float(light @ _brightness(levels.mean_DN - levels.dark_DN[:, None], use)) / max(float(light @ light), 1e-30)
-    start = np.array([K, V0, 0.0, gain if gain > 0 else 1.0, 0.0])
+    start = np.array([K, V0, 0.0, gain if gain > 0 else 1.0, 0.0, 0.0])
     # A variance and the mean of its bin have correlated errors for Poisson counts, and independent ones for read noise.
     variance, q2 = np.maximum(levels.variance_DN2, 1e-9), 12 * dark.rounding_DN2
     apart = K**2 * max(V0, 0.0) / levels.samples / variance**2
@@ -236,14 +247,19 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
     most = q2 * (1 / np.pi**2 + 4 * noise) * np.exp(-2 * np.pi**2 * noise)
     apart += 0.5 * (most / variance) ** 2 * use.sum(axis=1, keepdims=True)
     levels = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
-    sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, max(light.max(), 1e-30)])
+    scales = 1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, max(light.max(), 1e-30), (abs(K) + 1e-9) / full_DN
+    sizes = np.abs(start) + np.array(scales)
     simplest = TransferProblem(levels, dark, Order(), rules.most_bent / full_DN, sizes)
     first = simplest.attempt(start)
     # The other orders start from the simplest one.
     start = first.fit.values if first.fit.converged else start
     others = [Order(curved, offset, unsteady) for unsteady, offset, curved in product((False, True), repeat=3)][1:]
     others = others if levels.responding.any() else [Order(curved=True)]
-    return choose([first, *(replace(simplest, order=order).attempt(start) for order in others)])
+    tried = [first, *(replace(simplest, order=order).attempt(start) for order in others)]
+    # Gain noise that is left out bends the response, or makes the light unsteady, if it does anything.
+    beside = dict.fromkeys([Order(), Order(curved=True), choose(tried).best.fit.order])
+    noisy = (replace(simplest, order=replace(order, gain_noise=True)).attempt(start) for order in beside)
+    return choose([*tried, *noisy])
 
 
 def robust_transfer(
