@@ -42,7 +42,7 @@ def _bend(darks: tuple[Moments, ...], term: Noise) -> Pattern:
     frames = np.concatenate([_frame_means(one) for one in darks])
     level = np.asarray(linear_signal(frames - black, float(np.asarray(term.bend_per_DN)), K))
     # Rows are independent, and their means scatter by the noise of rows and of samples.
-    variance = np.concatenate([np.full(one.frames, one.rows_DN2 / one.height) for one in darks])
+    variance = np.concatenate([np.full(one.frames, one.rows.variance_DN2 / one.height) for one in darks])
     sigma = np.sqrt(np.maximum(variance, 1e-12))
     times, number = np.unique(exposure, return_inverse=True)
     inside = np.eye(len(times))[number] / sigma[:, None]

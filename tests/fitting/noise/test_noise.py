@@ -12,6 +12,7 @@ from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise import codes, frame_moments
 from udccal.fitting.noise.data import Averaged, Codes, NoiseRules
 from udccal.fitting.noise.fit import fit_moments, nominal_noise
+from udccal.fitting.noise.line_noise import LineNoise
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import dsnu, prnu
 from udccal.models.noise import Noise
@@ -230,7 +231,8 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     rng = np.random.default_rng(2)
     dark = 64 + 0.3 * rng.standard_normal((100, 100))
     dark[3, 4] = dark[50, 60] = 90.0
-    assert dsnu(dark, Quantity(0.09, 0.0), 0.0, RULES.defect_sigma, 1).places == ((3, 4), (50, 60))
+    none = LineNoise(Quantity(0.0, 0.0, False), 99.0, False)
+    assert dsnu(dark, Quantity(0.09, 0.0), none, none, 1, RULES.defect_sigma, 1).places == ((3, 4), (50, 60))
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
     counts = np.bincount(frame.ravel())
     assert codes.converter_step(counts) == 1

@@ -186,6 +186,42 @@ def test_codes_that_never_occur_are_told(change: Callable[[np.ndarray, int], np.
     assert not noted(measure(SENSOR, 3), "never occur")
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_bands_of_rows_count_as_few_rows(seed: int) -> None:
+    """All rows counted, though two numbers describe a band: DSNU was up to 31 sigma off, of 32 frames."""
+    rng = np.random.default_rng(seed)
+
+    def banded(codes: np.ndarray, _: int) -> np.ndarray:
+        rows = 1.5 * np.sin(2 * np.pi * (np.arange(SHAPE[0]) / 48 + rng.random()))
+        return np.rint(codes + rows[:, None] + rng.random(SHAPE) - 0.5).astype(int)
+
+    sensor = replace(SENSOR, K_DN_per_e=1.0, bits=14, DSNU_e=1.0)
+    result = fit_noise(changed(captured(sensor, seed), banded))
+    assert noted(result, "in bands")
+    # Dithered codes have the variance of rounding once more.
+    true = {"DSNU1288_e": 1.0, "sigma_row_DN": 1.5 / 2**0.5, "sigma_d_e": (16 + 1.125 + 1 / 12) ** 0.5}
+    for name, truth in true.items():
+        assert abs(z(result, name, truth)) < 3.0, name
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_noise_that_columns_share_is_told_and_its_draws_are_in_the_sigmas(seed: int) -> None:
+    """Pixels counted, and not columns: the sigmas of sigma_d and DSNU were half of what they are."""
+    rng = np.random.default_rng(seed)
+
+    def striped(codes: np.ndarray, _: int) -> np.ndarray:
+        return np.rint(codes + 2 * rng.standard_normal(SHAPE[1]) + rng.random(SHAPE) - 0.5).astype(int)
+
+    sensor = replace(SENSOR, K_DN_per_e=1.0, bits=14, DSNU_e=1.0)
+    data = captured(sensor, seed)
+    result = fit_noise(changed(data, striped))
+    assert noted(result, "Columns share noise of")
+    true = {"DSNU1288_e": 1.0, "K_DN_per_e": 1.0, "sigma_d_e": (16 + 4 + 1 / 12) ** 0.5}
+    for name, truth in true.items():
+        assert abs(z(result, name, truth)) < 3.0, name
+    assert not noted(fit_noise(data), "share noise")
+
+
 @pytest.mark.parametrize("bent_DN", [0, 100])
 def test_noise_in_proportion_to_the_signal_of_a_pixel_is_told(bent_DN: int) -> None:
     """It was no part of the curve. Where chi-squared of all bins did not see it, K was up to 21 sigma too large."""

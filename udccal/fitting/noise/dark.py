@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.misfit import chi2_tail, excess_sigma, excess_variance
+from udccal.fitting.engine.misfit import chi2_tail, excess_sigma
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.codes import LOW, DarkFit, Five, excess_kurtosis, fit_dark, pair_probability, row_gain
+from udccal.fitting.noise.line_noise import LineNoise, column_noise, row_noise
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Cov, DarkTerms, dsnu
 
@@ -26,15 +27,18 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature
     ``curvature`` is the response's in 1/DN: dark signal bends as light does.
     """
     codes, stack = _with_means(data, _fit_codes(data, K_DN_per_e, start)), data.dark_stack
-    fit, (read, foreign) = codes.fit, _read_noise(data, codes, K_DN_per_e)
+    fit, columns = codes.fit, codes.columns
+    read, foreign = _read_noise(data, codes, K_DN_per_e)
     # Of one frame of the stack.
     shot = K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s
     single = Quantity(read.value + shot + data.rounding_DN2, read.variance)
     if seen := data.dark_seen:
         # Its own frames say what noise the average has, whatever the distribution.
         single = Quantity(seen.near_DN2, 2 * seen.near_DN2**2 / float(seen.dof.sum()))
+        single = replace(single, variance=single.variance + columns.drawn_DN4(seen.frames - 1))
     temporal = Quantity(single.value / stack.frames, single.variance / stack.frames**2)
-    offsets = dsnu(stack.mean_DN, temporal, codes.row_DN**2 / stack.frames, data.rules.defect_sigma, data.q_DN)
+    rules = data.rules
+    offsets = dsnu(stack.mean_DN, temporal, codes.rows, columns, stack.frames, rules.defect_sigma, data.q_DN)
     if not codes.white:
         # Rounding biases the average: the histograms tell the offsets.
         sigma, pixels = float(np.hypot(fit.cov[3, 3] ** 0.5, codes.unresolved_DN2)), stack.mean_DN.size
@@ -44,22 +48,23 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature
     levels = _levels(data, codes, more, curvature)
     spread = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
     shape = Quantity(float(fit.values[4]), float(fit.cov[4, 4]))
-    noise, flags = (read, shape, codes.row, spread), (codes.white, foreign, codes.skewed)
-    return DarkTerms(K_DN_per_e, curvature, *levels, *noise, *flags, fit, offsets)
+    flags = codes.white, foreign, codes.skewed
+    return DarkTerms(K_DN_per_e, curvature, *levels, read, shape, codes.rows, columns, spread, *flags, fit, offsets)
 
 
 @final
 @dataclass(frozen=True)
 class _Codes:
-    """The fit of the dark codes, and the row noise that agrees with it: ``row_DN`` is that of the pairs alone.
+    """The fit of the dark codes, and the noise of rows that agrees with it: ``row_DN`` is that of the pairs alone.
 
     ``unresolved_DN2`` is the row noise that rounding may hide; ``white`` and ``skewed`` as in ``DarkTerms``. Mean codes
     would change black and dark current by ``doubt``.
     """
 
     fit: DarkFit
-    row: Quantity
+    rows: LineNoise
     row_DN: float
+    columns: LineNoise
     unresolved_DN2: float
     white: bool
     doubt: Two
@@ -73,45 +78,49 @@ def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five) -> _Codes:
     def fitted(row_DN: float, start: Five, normal: bool = False) -> DarkFit:
         return fit_dark(data.darks, K_DN_per_e, row_DN, rules, start, normal)
 
-    row, row_DN = _row_noise(data, np.ones(len(data.darks)))
+    rows, row_DN = row_noise(data, np.ones(len(data.darks)))
     fit = fitted(row_DN, start)
     for _ in range(10):
         gains = np.array([row_gain(pair, fit.values, K_DN_per_e, row_DN) for pair in data.darks])
-        before, (row, row_DN) = row_DN, _row_noise(data, gains)
-        if abs(row_DN**2 - before**2) <= 0.1 * row.variance**0.5:
+        before, (rows, row_DN) = row_DN, row_noise(data, gains)
+        if abs(row_DN**2 - before**2) <= 0.1 * rows.DN2.variance**0.5:
             break
         # Each depends on the other in the opposite sense: half-way between is near to where both agree.
         row_DN = float(np.sqrt(0.5 * (row_DN**2 + before**2)))
         fit = fitted(row_DN, fit.values)
     if float(fit.values[2]) + row_DN**2 < (0.15 * data.q_DN) ** 2:
         # Temporal noise below 0.15 of a code cannot be distinguished from the pattern of rounding.
-        row, unresolved = _row_noise(data, np.zeros(len(data.darks)))[0], data.rounding_DN2
-    fit = _with_drawn_rows(fit, data, row_DN)
+        rows, unresolved = row_noise(data, np.zeros(len(data.darks)))[0], data.rounding_DN2
+    columns = column_noise(data)
+    fit = _with_drawn_lines(fit, data, row_DN, rows, columns)
     if row_DN > 0 and np.abs(gains - 1).max() > rules.white:
         # Rounding hides part of the row noise, and what is wrong with it is taken for read noise.
-        fit = fit.doubted(fitted(float(np.sqrt(max(row_DN**2 - row.variance**0.5, 0.0))), fit.values).values)
+        fit = fit.doubted(fitted(float(np.sqrt(max(row_DN**2 - rows.DN2.variance**0.5, 0.0))), fit.values).values)
     # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
     white = fit.follows and 4 * np.pi**2 * float(fit.values[2]) >= rules.smeared * data.q_DN**2
     if not white:
         # Coarse codes hardly show the distribution, and all that they tell but its shape depends on it.
         fit = fit.doubted(np.append(fitted(row_DN, fit.values, True).values[:4], fit.values[4]))
         fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
-    return _Codes(fit, row, row_DN, unresolved, white, np.zeros(2))
+    return _Codes(fit, rows, row_DN, columns, unresolved, white, np.zeros(2))
 
 
-def _with_drawn_rows(fit: DarkFit, data: NoiseMoments, row_DN: float) -> DarkFit:
-    """The fit with the error that a finite number of rows adds to its covariance.
+def _with_drawn_lines(fit: DarkFit, data: NoiseMoments, row_DN: float, rows: LineNoise, columns: LineNoise) -> DarkFit:
+    """The fit with the error that a finite number of rows and columns adds to its covariance.
 
     All samples of a row share one draw of its noise, and the draws of a few hundred rows have tails of their own. The
     fit, which takes them for normal, gives these to the read noise. Rows of two frames that agree by chance look like
-    offsets of pixels; where there are none, rows that disagree look like less read noise.
+    offsets of pixels; where there are none, rows that disagree look like less read noise. The noise of columns is a
+    part of the read noise, with the error of its draws.
     """
-    rows, (_, _, read, spread2, shape), cov = sum(pair.rows for pair in data.darks), fit.values.tolist(), fit.cov.copy()
-    cov[[2, 3], [2, 3]] += np.array([spread2 <= 1.001 * LOW[3], True]) * row_DN**4 / rows
+    (_, _, read, spread2, shape), cov, pairs = fit.values.tolist(), fit.cov.copy(), len(data.darks)
+    drawn, by_column = row_DN**4 / (pairs * rows.independent), columns.drawn_DN4(pairs)
+    cov[[2, 3], [2, 3]] += np.array([spread2 <= 1.001 * LOW[3], True]) * drawn + [by_column, 0.5 * by_column]
     if cov[4, 4] > 0:
         slope = (excess_kurtosis(shape + 0.01) - excess_kurtosis(shape - 0.01)) / 0.02
         # The fourth cumulant of n normal draws has the variance 24 sigma^8 / n, and a pair has two of each row.
-        error = min(float(np.sqrt(12 / rows)) * row_DN**4 / (abs(slope) * read**2), data.rules.shape_sigma)
+        fourth = float(np.sqrt(12 * drawn * row_DN**4 + 6 * by_column * columns.DN2.value**2))
+        error = min(fourth / (abs(slope) * read**2), data.rules.shape_sigma)
         along = fit.cov[:, 4] / fit.cov[4, 4] * error
         cov += np.outer(along, along)
     return replace(fit, cov=cov)
@@ -206,7 +215,7 @@ def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float) -> tuple[Q
             p = pair_probability(pair, values, K_DN_per_e, codes.row_DN, 0.0)
             by_row = row_gain(pair, values, K_DN_per_e, codes.row_DN) * codes.row_DN
             expected[i] = float(np.sum(p * pair.differences_DN**2)) / (2 * float(p.sum())) - by_row**2
-    more = unexplained_variance(data, expected, data.rules.most_hits, codes.skewed)
+    more = unexplained_variance(data, expected, data.rules.most_hits, codes.columns, codes.skewed)
     if abs(more.value) > data.rules.foreign_sigma * more.variance**0.5:
         # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
         # codes tell of the rest depends on the distribution as well.
@@ -217,15 +226,18 @@ def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float) -> tuple[Q
     return Quantity(read, variance), False
 
 
-def unexplained_variance(data: NoiseMoments, expected_DN2: PerPair, most_hits: float, of_all: bool = False) -> Quantity:
+def unexplained_variance(
+    data: NoiseMoments, expected_DN2: PerPair, most_hits: float, columns: LineNoise, of_all: bool = False
+) -> Quantity:
     """Temporal variance of dark samples, without row noise, less that expected in each pair.
 
-    It comes from the differences of the codes, and its sigma from their fourth moment. Differences taken for hits count
-    where they are more than ``most_hits`` of all: radiation does not hit so often, so that they are tails of the noise,
-    or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the variance over all pixels). Pixels far
+    It comes from the differences of the codes, and its sigma from their fourth moment and the draws of ``columns``.
+    Differences taken for hits count where they are more than ``most_hits`` of all: radiation does not hit so often, so
+    that they are tails of the noise, or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the
+    variance over all pixels). Pixels far
     from the others count only where ``of_all`` is True: hot ones have shot noise, dead ones have none.
     """
-    values, variances = _temporal(data, most_hits, of_all)
+    values, variances = _temporal(data, most_hits, columns, of_all)
     weights = 1.0 / variances
     return Quantity(float(np.average(values - expected_DN2, weights=weights)), float(1.0 / weights.sum()))
 
@@ -235,7 +247,7 @@ def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
 
     Then exposure times are those of other frames. Where black drifts, noise rises with neither.
     """
-    values, variances = _temporal(data, data.rules.most_hits, dark.skewed)
+    values, variances = _temporal(data, data.rules.most_hits, dark.columns, dark.skewed)
     means, times = np.array([(pair.mean_DN, pair.exposure_s) for pair in data.darks]).T
 
     def off(signal_DN: PerPair) -> float:
@@ -249,39 +261,12 @@ def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
     return bool(beyond and by_time > most and off(means) < 0.1 * by_time)
 
 
-def _temporal(data: NoiseMoments, most_hits: float, of_all: bool) -> tuple[PerPair, PerPair]:
+def _temporal(data: NoiseMoments, most_hits: float, columns: LineNoise, of_all: bool) -> tuple[PerPair, PerPair]:
     """Temporal variance of each dark pair, and its own variance."""
     tails = sum(of.outliers for of in data.dark_moments) > most_hits * sum(of.pixels for of in data.dark_moments)
     values, variances = [], []
     for pair, of in zip(data.darks, data.dark_moments, strict=True):
         values.append((of.temporal_DN2 if of_all else of.near_DN2) + tails * of.outlier_variance_DN2)
         fourth = (np.sum(pair.counts * pair.differences_DN**4) + tails * of.outlier_powers[1]) / of.pixels
-        variances.append(max(fourth / 4 - values[-1] ** 2, values[-1] ** 2) / of.pixels)
+        variances.append(max(fourth / 4 - values[-1] ** 2, values[-1] ** 2) / of.pixels + columns.drawn_DN4(1))
     return np.array(values), np.maximum(variances, 1e-30)
-
-
-def _row_noise(data: NoiseMoments, row_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
-    """Variance by rows, and its root in the pairs alone, which is the one that widened their histograms.
-
-    Rounding and cut-off codes change the variance of a pair by the square of its ``row_gains``. How much depends on the
-    distribution of the read noise, which coarse codes hardly show: half of the change is in the sigma.
-    """
-    seen, pairs = data.dark_moments, len(data.darks)
-    if data.dark_seen is not None:
-        nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
-        seen, row_gains = (*seen, data.dark_seen), np.append(row_gains, row_gains[nearest])
-    every = [(of.rows_DN2, of.sampling_DN2, (of.frames - 1) * max(of.height - 1, 1)) for of in seen]
-    # Pairs whose mean code follows black to less than a fifth do not determine row noise.
-    used = [i for i, gain in enumerate(row_gains) if gain >= 0.2 and every[i][0] > 0]
-
-    def asked(used: list[int]) -> Quantity:
-        if not used:
-            # Row noise that rounding hides completely may be as large as rounding itself.
-            return Quantity.asked("row noise", 0.0, data.rounding_DN2**2, data.dark_samples, 0.0)
-        rows, sampling, dof = np.array(every)[used].T
-        squares = row_gains[used] ** 2, (0.5 * (1 + row_gains[used])) ** 2
-        (value, variance, gain), (other, _, _) = (excess_variance(rows / of, sampling / of, dof) for of in squares)
-        return Quantity.asked("row noise", value, variance + (value - other) ** 2, data.dark_samples, gain)
-
-    row = asked(used)
-    return row, float(np.sqrt(asked([i for i in used if i < pairs]).value)) if row.there else 0.0

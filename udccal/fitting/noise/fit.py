@@ -192,7 +192,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     poor, converged = fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked, dark.fit.converged or dark.foreign
     status = FitStatus.CONVERGED if fit.converged and converged else FitStatus.NOT_CONVERGED
     shown = len(NAMES) - (not fit.order.curved)
-    terms = (dark.row_DN2, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
+    terms = (dark.row_DN2, dark.columns.DN2, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
     candidates = [*(one for term in terms for one in term.candidates), *response.candidates]
     outside = len(data.darks) * data.flat_stack.mean_DN.size - data.dark_samples
     height, width = data.flat_stack.mean_DN.shape

@@ -184,7 +184,11 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     light, exposure_s, rows = np.array(
         [(of.light or np.nan, of.exposure_s, dark.row_DN2.value / (of.frames * of.height)) for of in flats]
     ).T
-    by_bin = above, variance, stacked(flats, "dof"), stacked(flats, "samples"), usable
+    # All bins of a level share the draws of its columns.
+    drawn = np.array([[dark.columns.drawn_DN4(of.frames - 1)] for of in flats]) * usable.sum(axis=1, keepdims=True)
+    dof = stacked(flats, "dof")
+    dof = dof / (1 + 0.5 * dof * drawn / np.maximum(variance, 1e-9) ** 2)
+    by_bin = above, variance, dof, stacked(flats, "samples"), usable
     return Levels(*by_bin, light, dark.dark_DN_per_s.value * exposure_s, rows + dark.unsteady_DN**2)
 
 
@@ -202,7 +206,8 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
         # Hot pixels are not in the dark current, unless it is skewed.
         variance = seen.temporal_DN2 if dark.skewed else seen.near_DN2
         tails = excess_kurtosis(dark.shape.value) * min(read.value, variance) ** 2 * (1 - 1 / seen.frames)
-        sigma = float(np.sqrt((2 * variance**2 + tails) / float(seen.dof.sum())))
+        drawn = dark.columns.drawn_DN4(seen.frames - 1)
+        sigma = float(np.sqrt((2 * variance**2 + tails) / float(seen.dof.sum()) + drawn))
         signal = rate * seen.exposure_s
         points.append((variance - rounding - K * signal, sigma, signal))
     values, sigmas, drifts = np.array(points).T

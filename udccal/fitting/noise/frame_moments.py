@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from udccal.fitting.noise.data import Averaged, Codes, NoiseRules, dark_window
+from udccal.fitting.noise.lines import Lines
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
 Picture = Float32[np.ndarray, "rows columns"]
@@ -92,11 +93,11 @@ class Moments:
     ``light`` is the relative exposure to light, in any unit common to all levels (photons per pixel, or seconds).
     ``variance_DN2`` is the temporal variance of one frame, row noise and common changes of brightness removed, and
     ``dof`` its degrees of freedom; ``samples`` are frames times pixels; ``spread_DN`` is the standard deviation over
-    these, spatial and temporal; ``shift_DN`` is the mean of each frame less that of all. ``rows_DN2`` is the variance
-    of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
-    is the fraction of the samples with the largest code, and ``codes`` the histogram of the first frame. ``outliers``
-    were hits, and left out; ``outlier_powers`` are the sums of the second and fourth powers of their differences from
-    the first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``far`` is how many
+    these, spatial and temporal; ``shift_DN`` is the mean of each frame less that of all. ``rows`` and ``columns`` are
+    what changes of their means from frame to frame; those of columns are without those of rows. ``at_peak`` is the
+    fraction of the samples with the largest code, and ``codes`` the histogram of the first frame. ``outliers`` were
+    hits, and left out; ``outlier_powers`` are the sums of the second and fourth powers of their differences from the
+    first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``far`` is how many
     pixels lie outside the window of the dark histograms in both of these, and what they have of all frames' squares.
     ``repeated``: some frames are copies of others.
     """
@@ -109,9 +110,8 @@ class Moments:
     samples: Float[np.ndarray, " bins"]
     spread_DN: Float[np.ndarray, " bins"]
     shift_DN: Float[np.ndarray, "frames bins"]
-    rows_DN2: float
-    sampling_DN2: float
-    height: int
+    rows: Lines
+    columns: Lines
     peak_DN: int
     at_peak: Float[np.ndarray, " bins"]
     codes: Int[np.ndarray, " codes"]
@@ -125,6 +125,11 @@ class Moments:
     def frames(self) -> int:
         """How many."""
         return len(self.shift_DN)
+
+    @property
+    def height(self) -> int:
+        """Rows of a frame."""
+        return len(self.rows.power_DN2)
 
     @property
     def pixels(self) -> float:
@@ -187,8 +192,8 @@ def _fingerprint(frame: Codes) -> int | None:
 class _Sums:
     """Sums over frames of what differs from the first one.
 
-    ``seen`` has of every frame its rows' means, its bins' sums less these, its ``far`` pixels, its largest code and how
-    many samples of each bin have that.
+    ``seen`` has of every frame its rows' means, its columns' means and bins' sums less these, its ``far`` pixels, its
+    largest code and how many samples of each bin have that.
     """
 
     def __init__(self, first: Codes, period: int, hit_sigma: float, far: Int[np.ndarray, " far"]) -> None:
@@ -200,7 +205,7 @@ class _Sums:
         self._outliers, self._powers = 0, np.zeros(2)
         self._shared: Shared | None = None
         self._marks = [_fingerprint(first)]
-        none = np.zeros(len(first)), np.zeros_like(self._counts), np.zeros(far.size)
+        none = *(np.zeros(side) for side in first.shape), np.zeros_like(self._counts), np.zeros(far.size)
         self._seen = [(*none, *self._at_peak(first))]
 
     def add(self, frame: Codes) -> None:
@@ -211,18 +216,20 @@ class _Sums:
         self._shared = self._shared or shared_noise(self._first, difference, self._period)
         self._marks.append(_fingerprint(frame))
         far = difference.ravel()[self._far].astype(np.float64)
-        self._seen.append((rows, self._binned(difference), far, *self._at_peak(frame)))
+        columns = difference.mean(axis=0, dtype=np.float64)
+        self._seen.append((rows, columns, self._binned(difference), far, *self._at_peak(frame)))
         self._total += difference
         self._squares += self._binned(cv2.multiply(difference, difference))
 
     def reduced(self, exposure_s: float, light: float) -> tuple[Averaged, Moments]:
         """The mean picture and the moments."""
-        rows, left, far, peaks, at_peak = (np.stack(part) for part in zip(*self._seen, strict=True))
+        rows, across, left, far, peaks, at_peak = (np.stack(part) for part in zip(*self._seen, strict=True))
         (number, height), counts, marks = rows.shape, self._counts, [mark for mark in self._marks if mark]
         mean_DN = cv2.addWeighted(self._first, 1.0, self._total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
         mean_DN += rows.mean(axis=0)[:, None]
         left -= left.mean(axis=0)
         rows -= rows.mean(axis=0)
+        across -= across.mean(axis=0)
         columns, common = mean_DN.shape[1], np.square(left).sum(axis=0) / counts
         dof = np.maximum((number - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
         squares = self._squares - self._binned(cv2.multiply(self._total, self._total, scale=1.0 / number)) - common
@@ -234,7 +241,7 @@ class _Sums:
         about = cv2.subtract(mean_DN, middle)
         level = self._binned(about) / counts
         spatial = np.maximum(self._binned(cv2.multiply(about, about)) / counts - level**2, 0.0)
-        of_rows = float(np.square(rows - rows.mean(axis=1, keepdims=True)).sum())
+        usual = float(np.average(variance, weights=counts))
         moments = Moments(
             exposure_s=exposure_s,
             light=light,
@@ -244,9 +251,8 @@ class _Sums:
             samples=number * counts.ravel(),
             spread_DN=np.sqrt(spatial + np.maximum(variance, 0.0) * (1 - 1 / number)).ravel(),
             shift_DN=((left + (rows @ self._down.T)[..., None] * self._width) / counts).reshape(number, -1),
-            rows_DN2=of_rows / ((number - 1) * max(height - 1, 1)),
-            sampling_DN2=float(np.average(variance, weights=counts)) / columns,
-            height=height,
+            rows=Lines.of(rows, usual / columns),
+            columns=Lines.of(across, usual / height),
             peak_DN=int(peaks.max()),
             at_peak=(at_peak[peaks == peaks.max()].sum(axis=0) / (number * counts)).ravel(),
             codes=np.bincount(self._first.ravel()),

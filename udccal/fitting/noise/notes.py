@@ -106,6 +106,13 @@ def _of_darks(data: NoiseMoments, dark: DarkTerms) -> Iterator[str]:
     if dark.skewed:
         found = "Read noise or dark current has one tail, which the model's has not"
         yield f"{found}: black and dark current are those of the mean code of all pixels."
+    if dark.rows.banded and dark.row_DN2.there:
+        found = f"Rows share noise of {dark.row_DN2.value**0.5:.2g} DN in bands, as of a supply"
+        count = f"{dark.rows.independent:.2g}"
+        yield f"{found}: the noise term takes rows for independent, and sigmas are those of {count} rows."
+    if dark.columns.DN2.there:
+        found = f"Columns share noise of {dark.columns.DN2.value**0.5:.2g} DN that changes from frame to frame"
+        yield f"{found}: it is a part of sigma_d, and the noise term takes it for noise of single pixels."
     if dark.unsteady_DN:
         found = f"The mean of dark frames is off black and dark current by {dark.unsteady_DN:.2g} DN"
         yield f"{found} from exposure to exposure; the sigmas of black, dark current and saturation include that."

@@ -22,6 +22,7 @@ from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
 from udccal.fitting.noise.codes import DarkFit
 from udccal.fitting.noise.frame_moments import product_sum
+from udccal.fitting.noise.line_noise import LineNoise
 
 Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
 Mask = Bool[np.ndarray, "rows columns"]
@@ -49,11 +50,19 @@ class Pattern:
     structure2: float = 0.0
 
 
-def dsnu(dark_DN: Picture, temporal: Quantity, row_DN2: float, defect_sigma: float, q_DN: int) -> Pattern:
+def dsnu(
+    dark_DN: Picture,
+    temporal: Quantity,
+    rows: LineNoise,
+    columns: LineNoise,
+    frames: int,
+    defect_sigma: float,
+    q_DN: int,
+) -> Pattern:
     """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), with row and column patterns.
 
-    The average has the variance ``temporal`` [DN^2] without row noise, which adds ``row_DN2``; ``q_DN`` is the
-    converter's step.
+    The average of so many ``frames`` has the variance ``temporal`` [DN^2], of which ``columns`` is a part, without the
+    noise of ``rows``; both are one frame's. ``q_DN`` is the converter's step.
     """
     about = dark_DN.astype(np.float64)
     sample = about[:: max(1, len(about) // 256)]
@@ -66,15 +75,17 @@ def dsnu(dark_DN: Picture, temporal: Quantity, row_DN2: float, defect_sigma: flo
     mean = float(about[~bad].mean()) if not bad.all() else 0.0
     about -= mean
     about[bad] = 0.0
-    (rows, columns), samples = about.shape, int(about.size - bad.sum())
+    (height, width), samples = about.shape, int(about.size - bad.sum())
     total = float(np.vdot(about, about)) / max(samples - 1, 1)
     by_row, by_column = float(np.var(about.mean(axis=1))), float(np.var(about.mean(axis=0)))
-    pixel = max(total - by_row - by_column, 0.0)
-    parts, counts = np.array([pixel, by_row, by_column]), np.array([samples, rows, columns])
-    own = np.maximum(parts - [temporal.value, pixel / columns + row_DN2, pixel / rows], 0.0)
-    # Each part is chi-squared with its own number of values; this sensor's own pattern is what is asked for.
-    drawn = float(np.sum(2 * np.maximum(parts**2 - own**2, 0.0) / counts))
-    variance, sigma = total - temporal.value - row_DN2, float(np.sqrt(drawn + temporal.variance))
+    pixel, row, column = max(total - by_row - by_column, 0.0), rows.DN2.value / frames, columns.DN2.value / frames
+    parts, counts = np.array([pixel, by_row, by_column]), [samples, rows.independent, columns.independent]
+    own = np.maximum(parts - [temporal.value - column, pixel / width + row, pixel / height + column], 0.0)
+    # Each part is chi-squared with its own number of values; this sensor's own pattern is what is asked for. Few bands
+    # may by chance be weak in the average.
+    drawn = float(np.sum(2 * np.maximum(parts**2 - own**2, np.square([0.0, row, column])) / counts))
+    drawn += temporal.variance + rows.DN2.variance * rows.DN2.there / frames**2
+    variance, sigma = total - temporal.value - row, float(np.sqrt(drawn))
     return Pattern(variance, sigma, samples, int(bad.sum()), _first_places(bad), mean)
 
 
@@ -96,13 +107,19 @@ class DarkTerms:
     unsteady_DN: float
     read_DN2: Quantity
     shape: Quantity
-    row_DN2: Quantity
+    rows: LineNoise
+    columns: LineNoise
     dsnu_DN2: Quantity
     white: bool
     foreign: bool
     skewed: bool
     fit: DarkFit
     offsets: Pattern
+
+    @property
+    def row_DN2(self) -> Quantity:
+        """Variance of the noise that rows share."""
+        return self.rows.DN2
 
 
 def _first_places(bad: Mask) -> tuple[tuple[int, int], ...]:

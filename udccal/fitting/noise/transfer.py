@@ -33,7 +33,7 @@ Six = Float[np.ndarray, "6"]
 
 
 # Gain noise of fewer sigma is no candidate.
-_LEAST_GAIN_NOISE = 2.0
+_LEAST_GAIN_NOISE = 3.0
 
 
 @final
