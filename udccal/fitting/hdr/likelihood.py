@@ -9,7 +9,10 @@ and variance v is therefore
 
 with h the inverse Mills ratio of the normal distribution. Where a precise sample is as likely clipped as not, the
 likeliest rate is too high by up to a third of its sigma: a low draw is measured well, a high one only by shorter
-exposures. So the bias of first order in the information is taken off (Cox and Snell 1968, equation 20; Firth 1993).
+exposures. So the bias of first order in the information is taken off (Cox and Snell 1968, equation 20; Firth
+1993). Where only shorter exposures measure, a low draw puts the likeliest rate at the level's edge, where curvature
+counts the clipped sample as a measurement. Sigma is then the root mean square distance of the rates that the samples
+allow (their posterior without a prior) from the stated one.
 
 A pixel's own offset (DSNU) is the same in all its samples. It enters the rate's sigma and the deviation of a sample,
 not the weights.
@@ -30,15 +33,12 @@ from jaxtyping import Bool, Float, Int, UInt16
 
 from udccal.arguments import check_number, number_of
 from udccal.errors import FitError
+from udccal.fitting.hdr.clipped import TINY, PerPixel, PerSample, bias_by_information, mills, moments_above
 from udccal.models.arrays import Arrayish
 from udccal.models.noise import Noise, linear_signal
 
-PerSample = Float[Arrayish, "n pixels"]
-PerPixel = Float[Arrayish, " pixels"]
-_PEAK = 0.3989422804  # of the normal density
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
 _LEAST_VARIANCE = 0.25
-_TINY = 1e-30
 # Numbers that a sensor may have: single precision holds their squares.
 _POSSIBLE: Final = {
     "K_DN_per_e": (1e-4, 1e5),
@@ -84,6 +84,7 @@ class HdrRules:
     bend_off: float = 0.01
     light_off: float = 0.25
     least_codes: float = 2.0
+    least_even: int = 64
 
 
 class SensorNumbers(eqx.Module):
@@ -140,27 +141,6 @@ class BlockMerge(eqx.Module):
     deviation2: PerPixel
 
 
-def _mills(z: PerSample, xp: ModuleType) -> PerSample:
-    """Density over upper tail of the normal distribution to 1e-3: Abramowitz and Stegun 7.1.26, from 5 on 26.2.12."""
-    far = xp.maximum(z, 5.0)
-    t = 1 / (1 + 0.23164189 * abs(z))
-    tail = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))))
-    bell = xp.exp(-0.5 * z * z)
-    near = xp.where(z >= 0, 0.79788456 / tail, 0.39894228 * bell / (1 - 0.5 * tail * bell))
-    return xp.where(z > 5, far + (1 - 2 / far**2) / far, near)
-
-
-def _bias_by_information(z: PerSample, ratio: PerSample, scale: PerSample, xp: ModuleType) -> PerPixel:
-    """Bias of the likeliest rate times its information; samples are censored at ``z`` sigma, ``scale`` is t / sigma.
-
-    With U the score, it is -(E[U^3] + E[U U']) / 2 over the expected information, each a sum over the pixel's samples.
-    """
-    density = _PEAK * xp.exp(-0.5 * z * z)
-    clipped = xp.where(z > -5, density / xp.maximum(ratio, _TINY), 1.0)
-    information = (scale**2 * (1 - clipped + density * (ratio - z))).sum(axis=0)
-    return 0.5 * (scale**3 * density * (1 + z * (z - ratio))).sum(axis=0) / xp.maximum(information, _TINY)
-
-
 def _upward_deviance(beyond: PerSample, mean: PerSample, variance: PerSample, xp: ModuleType) -> PerSample:
     """Deviance of scaled counts of this variance and skewness: few electrons scatter more upwards than downwards."""
     scale = xp.maximum(mean / variance, 0.03)
@@ -186,7 +166,7 @@ def merge_block(
     light = sensor.electrons(frames.astype(np.float32))
     is_open, is_clipped = (light < sensor.level_e) & ~left_out, (light >= sensor.level_e) & ~left_out
     electrons = xp.where(is_open, light - sensor.dark_e_per_s * time, 0).sum(axis=0)
-    rate = electrons / xp.maximum(xp.where(is_open, time, 0).sum(axis=0), _TINY)
+    rate = electrons / xp.maximum(xp.where(is_open, time, 0).sum(axis=0), TINY)
     # One round with the unclipped samples only, two with the clipped ones too: more move no pixel by 1 % of its sigma.
     for with_clipped in (False, True, True):
         mean, variance = expected(rate)
@@ -196,23 +176,25 @@ def merge_block(
             z = (sensor.level_e - mean) / xp.sqrt(variance)
             # The rate that the unclipped samples give has its own error.
             known = information.sum(axis=0)
-            apart = xp.sqrt(1 + xp.where(known > 0, slope * time / xp.maximum(known, _TINY), 0))
-            believed, ratio = is_clipped & (z < believed_sigma * apart), _mills(z, xp)
+            apart = xp.sqrt(1 + xp.where(known > 0, slope * time / xp.maximum(known, TINY), 0))
+            believed, (ratio, spread) = is_clipped & (z < believed_sigma * apart), mills(z, xp)
             score = xp.where(believed, time / xp.sqrt(variance) * ratio, score)
-            information = xp.where(believed, slope * time * ratio * (ratio - z), information)
-        total = xp.maximum(information.sum(axis=0), _TINY)
+            information = xp.where(believed, slope * time * (1 - spread), information)
+        total = xp.maximum(information.sum(axis=0), TINY)
         rate = rate + score.sum(axis=0) / total
     scale = xp.where(is_open | believed, time / xp.sqrt(variance), 0)
     # Where exposures lie so far apart that the first order is a sigma and more, it is no longer the bias.
-    bias = xp.minimum(_bias_by_information(z, ratio, scale, xp) / total, 1 / xp.sqrt(total))
+    bias = xp.minimum(bias_by_information(z, ratio, scale, xp) / total, 1 / xp.sqrt(total))
     # Where noise makes the rate negative, samples scatter as without light, not as their weights say.
-    stated = xp.maximum((information * variance / xp.maximum(variance, expected(0 * rate)[1])).sum(axis=0), _TINY)
+    stated = xp.maximum((information * variance / xp.maximum(variance, expected(0 * rate)[1])).sum(axis=0), TINY)
     mean, variance = expected(rate)
     # Below zero rate the rounds may not have settled: a sample's deviation is that from the rate of these weights.
     slope = xp.where(is_open, time / variance, 0)
-    now = xp.maximum((slope * time).sum(axis=0), _TINY)
+    now = xp.maximum((slope * time).sum(axis=0), TINY)
     settled, share = (slope * (light - mean)).sum(axis=0) / now, time**2 / (variance * xp.maximum(total, now))
     left = xp.where(is_open, xp.maximum(1 - share, 1e-3), 1 + share)
+    level = sensor.level_e / time - sensor.dark_e_per_s
+    mean_above, spread2 = moments_above(believed, level, variance / time**2, rate + settled, 1 / now, xp)
     mean = mean + xp.where(is_clipped.any(axis=0), 0, settled) * time
     # The least deviation of a sample that is clipped although the others give a far lower rate.
     beyond = xp.where(is_open, light - mean, xp.maximum(sensor.level_e - mean, 0)) / xp.sqrt(left)
@@ -224,7 +206,8 @@ def merge_block(
     fewer = xp.where(beyond > 0, xp.minimum(own, _upward_deviance(beyond, mean, variance, xp)), own)
     deviation2 = xp.take_along_axis(fewer, worst[None], axis=0)[0]
     offset = sensor.offset_e * slope.sum(axis=0) / now
-    return BlockMerge(rate - bias, xp.sqrt(1 / stated + offset**2), used, worst, deviation2)
+    spread2 = xp.where(believed.any(axis=0), spread2 + (rate - bias - mean_above) ** 2, 1 / stated)
+    return BlockMerge(rate - bias, xp.sqrt(spread2 + offset**2), used, worst, deviation2)
 
 
 compiled_merge_block = jax.jit(functools.partial(merge_block, xp=jnp), static_argnames="believed_sigma")

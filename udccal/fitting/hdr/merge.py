@@ -80,8 +80,8 @@ def merge_bracket(
         rate and sigma in e-/s of every pixel, and the outliers.
 
     Raises:
-        FitError: when frames are not codes, exposures are impossible or not as many as frames, or a number of the noise
-            is impossible.
+        FitError: when frames are not codes or have no pixels, exposures are impossible or not as many as frames, or a
+            number of the noise is impossible.
     """
     rules = rules or HdrRules()
     times = _checked(frames, exposures_s)
@@ -123,6 +123,8 @@ def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposur
     if not isinstance(frames, np.ndarray) or frames.dtype.kind not in "ui" or frames.ndim < 2:
         expected = "Expected frames as an array of whole codes, frame by frame"
         raise FitError(f"{expected}, found {found_instead(frames)}. Pass raw codes.")
+    if len(frames) and not frames.size:
+        raise FitError(f"Expected frames with pixels, found the shape {frames.shape}. Pass whole frames.")
     try:
         times = np.asarray(exposures_s, dtype=np.float64)
     except (TypeError, ValueError):
@@ -252,6 +254,11 @@ class _Bracket:
 
     def doubts(self, merged: BlockMerge, unlike: Int[np.ndarray, " off"]) -> Iterator[str]:
         """Sentences for samples that contradict the noise model, or one another."""
+        if (stuck := self._stuck()).size:
+            yield (
+                f"All pixels of frame {stuck[0]} have the code {self.codes[stuck[0], 0]}, where noise is expected: "
+                f"the stream is stuck ({stuck.size} of {len(self.times)} frames). Check the camera; capture anew."
+            )
         scatter, black_DN = self._scatter(merged), self._black_off(merged) / self.sensor.e_per_DN
         # Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
         scores = self._frame_scores(merged, 2, 3.0)
@@ -282,6 +289,15 @@ class _Bracket:
         elif differs:
             few = "too few pixels have a third sample that tells which one is right"
             yield f"The light of frame {scores.argmax()} differs from that of the frames beside it, and {few}. {advice}"
+
+    def _stuck(self) -> Int[np.ndarray, " stuck"]:
+        """Open frames that have one code at all pixels, where noise of some codes makes that impossible."""
+        codes = self.codes[:, :: max(1, self.codes.shape[1] // _JUDGED)]
+        first = codes[:, :1].astype(np.float64)
+        # Code 0 cuts off the noise about a black level below it.
+        free = (self.sensor.electrons(first) < self.sensor.level_e) & ((first > 0) | (self.sensor.black_DN > 0))
+        judged = codes.shape[1] >= self.rules.least_even and self.sensor.rounded_below_e == 0
+        return np.flatnonzero((codes == first).all(axis=1) & (free & ~self.dropped)[:, 0] & bool(judged))
 
     def _scatter(self, merged: BlockMerge) -> float:
         """Variance of samples about their pixel's light over the model's; 1 where that is what chance gives."""
