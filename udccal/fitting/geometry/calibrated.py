@@ -255,7 +255,8 @@ def _remarks(found: CalibratedViews, scales: Float[np.ndarray, " views"], by_pri
     if found.disagreement.found:
         yield (
             f"The views disagree on the lens beyond their noise (ratio {found.disagreement.ratio:.1f}, "
-            f"p = {found.disagreement.p_value:.1g}); sigma is that of views that differ so. Is the board flat?"
+            f"p = {found.disagreement.p_value:.1g}); sigma is that of views that differ so. "
+            "What all views have in common is not in it: the lens may be off by more. Is the board flat?"
         )
     if found.pattern.found:
         yield (

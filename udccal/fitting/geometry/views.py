@@ -21,6 +21,7 @@ from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.misfit import chi2_test
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import Cauchy, outliers, robust_sigma
+from udccal.fitting.geometry.board_shape import board_shape
 from udccal.fitting.geometry.bundle import (
     EVERY,
     NOTHING_KNOWN,
@@ -78,12 +79,17 @@ def calibrate_views(
     robust, given, strange = _distinct(
         given, least, lambda points: _Search(points, known).best_of(starts(points, image_size, start, start_poses))
     )
-    likely = _scaled(robust, replace(given, used=robust.points.used), EVERY, known)
+    given = replace(given, used=robust.points.used)
+    likely = _scaled(robust, given, EVERY, known)
+    if shape := board_shape(likely.solved, likely.points, EVERY, known, likely.dof):
+        likely = _scaled(likely, replace(given, board=shape.points.board), EVERY, known)
     orders, between = _choose_order(likely, known)
     free = ORDERS[orders.best.name]
     final = _scaled(replace(likely, solved=orders.best.fit), likely.points, free, known)
     points, solved, bundle = final.points, final.solved, final.solved.place.facing()
     disagree, cov = disagreement(solved, points, free, final.dof)
+    if shape:
+        cov = cov + shape.added_cov(solved, points, free)
     pattern, pattern_px = residual_pattern(solved, points, image_size, final.dof)
     places = (f"view {points.names[points.view[k]]}, point {points.index[k]}" for k in np.flatnonzero(~points.used))
     views = CalibratedViews(
@@ -99,7 +105,7 @@ def calibrate_views(
         pattern=pattern,
         pattern_px=pattern_px,
         status=FitStatus.CONVERGED if solved.converged else FitStatus.NOT_CONVERGED,
-        notes=gathered.notes,
+        notes=(*gathered.notes, *(shape.told() if shape else ())),
         outliers=(*gathered.outliers, *strange, *rules.corners.listed(places)),
         iterations=likely.solved.iterations,
         image_size=image_size,
