@@ -180,6 +180,24 @@ def test_a_black_level_that_moves_is_told_and_in_the_sigmas() -> None:
     assert not noted(measure(sensor, 3), "from exposure to exposure")
 
 
+def test_dark_current_that_grows_while_exposures_do_is_told() -> None:
+    """It was called a tail of the read noise, and dark current was 9 sigma above that of the first frames."""
+    times, rng = tuple(np.linspace(0.1, 1.0, 10).tolist()), np.random.default_rng(9)
+    sensor = replace(SENSOR, K_DN_per_e=1.0, bits=14, dark_times_s=times)
+    first = 2 * len(sensor.levels)
+
+    def warmer(codes: np.ndarray, k: int) -> np.ndarray:
+        seconds = times[(k - first) // 2] if first <= k < first + 2 * len(times) else 0.1
+        return codes + rng.poisson(40.0 * seconds * 0.04 * max(k - first, 0), SHAPE)
+
+    data = captured(sensor, 3)
+    result = fit_noise(changed(data, warmer))
+    assert noted(result, "dark current or black drifted")
+    assert not noted(result, "one tail")
+    assert abs(z(result, "dark_current_e_per_s", 40.0)) < 4.5
+    assert not noted(fit_noise(data), "drifted")
+
+
 @pytest.mark.parametrize("change", [lambda codes, _: codes | 4, lambda codes, _: codes + (codes % 8 == 3)])
 def test_codes_that_never_occur_are_told(change: Callable[[np.ndarray, int], np.ndarray]) -> None:
     assert noted(fit_noise(changed(captured(SENSOR, 3), change)), "never occur")

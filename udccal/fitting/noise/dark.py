@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.misfit import chi2_tail, excess_sigma
+from udccal.fitting.engine.misfit import chi2_tail, excess_sigma, f_test
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.codes import LOW, DarkFit, Five, excess_kurtosis, fit_dark, pair_probability, row_gain
 from udccal.fitting.noise.line_noise import LineNoise, column_noise, row_noise
@@ -149,8 +149,10 @@ def _with_means(data: NoiseMoments, found: _Codes) -> _Codes:
         return found
     times, codes = np.array([(pair.exposure_s, pair.mean_DN) for pair in data.darks]).T
     own = np.array([of.temporal_DN2 / (2 * of.pixels) + found.row_DN**2 / (2 * of.height) for of in dark])
-    by_codes, cov, _ = _line(codes, own if found.white else fit.variances_DN2, times)
-    doubt = by_codes - _line(fit.means_DN, fit.variances_DN2, times)[0]
+    # Of equal weights: where the means do not lie on a line, others would make another one.
+    weighed = own if found.white else fit.variances_DN2
+    by_codes, cov, _ = _line(codes, weighed, times)
+    doubt = by_codes - _line(fit.means_DN, weighed, times)[0]
     if not found.white or np.all(np.abs(doubt) <= data.rules.foreign_sigma * np.sqrt(np.diag(cov))):
         return replace(found, doubt=doubt)
     own += [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
@@ -165,8 +167,8 @@ def _kept_rounding(data: NoiseMoments, temporal_DN2: float) -> float:
 
 def _levels(
     data: NoiseMoments, codes: _Codes, more: tuple[float, float] | None, curvature: float
-) -> tuple[float, Quantity, Cov, float]:
-    """Black, dark current, their covariance and ``DarkTerms.unsteady_DN``, by every dark exposure's mean and weight.
+) -> tuple[float, Quantity, Cov, float, float]:
+    """Black, dark current, their covariance, and ``DarkTerms.unsteady_DN`` and ``drift_DN_per_s``, by all exposures.
 
     ``more`` is the stack's mean, and the temporal variance of one of its frames.
     """
@@ -178,13 +180,16 @@ def _levels(
         variances = np.append(variances, own + codes.row_DN**2 / len(stack.mean_DN) / stack.frames)
     means = means + curvature * np.maximum(means - float(fit.values[0]), 0.0) ** 2
     (black, rate), cov, left = _line(means, variances, times)
-    apart, unsteady = bool(np.ptp(times) > 0), 0.0
+    apart, unsteady, drift = bool(np.ptp(times) > 0), 0.0, np.zeros(2)
     if codes.white:
         dof = float(len(times) - 1 - apart)
         unsteady = excess_sigma(left**2, variances, np.ones_like(means), dof)
         # A few exposures tell the scatter of black only roughly (Student's t).
         unsteady *= (dof / max(dof - 2, 1)) ** 0.5
         (black, rate), cov, _ = _line(means, variances + unsteady**2, times)
+        # The stack was taken at another time.
+        pairs = np.s_[: len(data.darks)]
+        drift = _drift(means[pairs], variances[pairs] + unsteady**2, times[pairs]) if unsteady else drift
     cov = cov + np.outer(codes.doubt, codes.doubt)
     # Rounding of pixels without noise is the same in every frame.
     cov[0, 0] += _kept_rounding(data, float(fit.values[2])) / stack.mean_DN.size
@@ -199,8 +204,23 @@ def _levels(
         # Rounding hides the same in every exposure.
         cov[0, 0] += data.rounding_DN2
     cov[1, 1] += by_choice
+    # A dark current that drifts is there, though no number is its own.
+    cov += np.outer(drift, drift)
     # Black stays that of the line: a dark current too weak to be chosen must not shift it.
-    return float(black), current, cov, unsteady
+    return float(black), current, cov, unsteady, float(abs(drift[1]))
+
+
+def _drift(means: PerPair, variances: PerPair, times: PerPair) -> Two:
+    """How far black and dark current of a curve at the shortest exposure are from the line's; 0 if it bends by chance.
+
+    Exposures that are taken in order are bent by whatever drifts meanwhile.
+    """
+    line, _, left = _line(means, variances, times)
+    design = np.column_stack([np.ones_like(times), times, (times - times.min()) ** 2])
+    bent = np.linalg.lstsq(design / np.sqrt(variances)[:, None], means / np.sqrt(variances))[0]
+    off, rest = (float(np.sum(one**2 / variances)) for one in (left, means - design @ bent))
+    dof = len(times) - 2
+    return bent[:2] - line if f_test((off - rest) / off * dof, 1, float(dof)).found else np.zeros(2)
 
 
 def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float) -> tuple[Quantity, bool]:

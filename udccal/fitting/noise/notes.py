@@ -113,6 +113,9 @@ def _of_darks(data: NoiseMoments, dark: DarkTerms) -> Iterator[str]:
     if dark.columns.DN2.there:
         found = f"Columns share noise of {dark.columns.DN2.value**0.5:.2g} DN that changes from frame to frame"
         yield f"{found}: it is a part of sigma_d, and the noise term takes it for noise of single pixels."
+    if dark.drift_DN_per_s:
+        found = f"Means of dark frames bend over exposures, by {dark.drift_DN_per_s / dark.K_DN_per_e:.2g} e/s"
+        yield f"{found}: dark current or black drifted. Take dark frames once they are stable, or in random order."
     if dark.unsteady_DN:
         found = f"The mean of dark frames is off black and dark current by {dark.unsteady_DN:.2g} DN"
         yield f"{found} from exposure to exposure; the sigmas of black, dark current and saturation include that."

@@ -96,7 +96,8 @@ class DarkTerms:
 
     ``foreign``: no distribution of the family describes the read noise; its variance is that of the codes. ``skewed``:
     none describes the mean code; black and dark current are those of the mean of all pixels. Black differs from
-    exposure to exposure by ``unsteady_DN``, where that is more than noise.
+    exposure to exposure by ``unsteady_DN``, where that is more than noise. Where that is a curve over exposures, dark
+    current differs by ``drift_DN_per_s`` at the shortest.
     """
 
     K_DN_per_e: float
@@ -105,6 +106,7 @@ class DarkTerms:
     dark_DN_per_s: Quantity
     levels_cov: Cov
     unsteady_DN: float
+    drift_DN_per_s: float
     read_DN2: Quantity
     shape: Quantity
     rows: LineNoise
