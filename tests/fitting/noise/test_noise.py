@@ -149,7 +149,9 @@ def test_a_lamp_of_changing_pattern_is_a_poor_fit() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
     data = reduced(sensor, np.linspace(0.05, 0.6, 8), 1)
     bent = tuple(replace(flat, variance_DN2=flat.variance_DN2 * (1 + flat.mean_DN / 1000)) for flat in data.flats)
-    assert fit_moments(replace(data, flats=bent), nominal_noise(rig)).status is FitStatus.POOR_FIT
+    result = fit_moments(replace(data, flats=bent), nominal_noise(rig))
+    assert result.status is FitStatus.POOR_FIT
+    assert any("a lamp whose pattern changes" in note for note in result.notes)
 
 
 def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:

@@ -186,10 +186,16 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     saturation, uneven = find_saturation(data, dark, curve), _photo_response(data, dark, curve)
     PRNU2 = Quantity.asked("PRNU", uneven.variance, uneven.sigma**2, uneven.samples)
     values, cov = _values(data, dark, curve, saturation, PRNU2)
-    bent_too_far = abs(float(fit.values[2])) * max(curve.ceiling_DN - dark.black_DN, 1.0) >= 0.999 * rules.most_bent
+    full_DN = max(curve.ceiling_DN - dark.black_DN, 1.0)
+    bent_too_far = abs(float(fit.values[2])) * full_DN >= 0.999 * rules.most_bent
+    # Gain noise beyond shot noise is no sensor's: the lamp's pattern changes.
+    unsteady = bool(fit.values[5] * full_DN > fit.values[0])
     shared = shared_by_neighbours(data, curve)
     linked = shared.found and abs(shared.gain_factor - 1) > rules.most_shared
-    poor, converged = fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked, dark.fit.converged or dark.foreign
+    poor, converged = (
+        fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked or unsteady,
+        dark.fit.converged or dark.foreign,
+    )
     status = FitStatus.CONVERGED if fit.converged and converged else FitStatus.NOT_CONVERGED
     shown = len(NAMES) - (not fit.order.curved)
     terms = (dark.row_DN2, dark.columns.DN2, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)

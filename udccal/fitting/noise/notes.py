@@ -74,7 +74,8 @@ def notes(
         yield _PRNU_BY_CURVE
     if curve.fit.order.gain_noise:
         found = f"Pixels have noise of {100 * curve.values[5] ** 0.5:.2g} % of their signal beside shot noise"
-        yield f"{found}: K is that of small signals, and the noise of bright ones is more than the term says."
+        cause = "from the pixels' gain or a lamp whose pattern changes"
+        yield f"{found}, {cause}: K is that of small signals, and the noise of bright ones is more than the term says."
     if (end := curve.off_its_end) is not None:
         found = (
             f"All variances of {_names(data)[end]}, the brightest inside the range, are off the photon transfer curve"
