@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 from tests.scenes.stamps import drawn
 from tests.scenes.unchecked import checked_with
 from udccal.errors import FitError
-from udccal.fitting.psf_stamps.data import Stamps, mosaic_channels
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules, mosaic_channels
 from udccal.fitting.psf_stamps.fit import StampsPsf, fit_psf_stamps
 from udccal.fitting.psf_stamps.search import Orders
+from udccal.fitting.psf_stamps.slope import without_slope
 from udccal.result import FitResult, FitStatus
 
 SENSOR = np.array([1000, 800])
@@ -206,6 +208,36 @@ def test_wrong_noise_is_no_good_fit_and_told() -> None:
     assert any("noise given" in note for note in result.notes)
 
 
+def test_noise_that_is_given_too_large_is_told() -> None:
+    """Values in DN that are passed as electrons look like it, too."""
+    rng = np.random.default_rng(9)
+    position = places(rng, 12)
+    middle = np.rint(position).astype(np.int64)
+    light = [5e4 * kernel(SENSOR / 2, shift, 15) for shift in position - middle]
+    noisy = rng.poisson(light) + READ_E * rng.standard_normal(np.shape(light))
+    for wrong in (Stamps(noisy, middle, 5 * READ_E), Stamps(0.36 * noisy, middle, 0.36 * READ_E)):
+        result = fit_psf_stamps(wrong, Orders(0, 0, 1.0))
+        assert any("Check the read noise, and that values are electrons" in note for note in result.notes), result.notes
+
+
+def test_crowded_stamps_that_many_images_do_not_describe_are_a_poor_fit() -> None:
+    rules = StampsRules(steps_to_end=1, evidence=-1e9, most_images=1)
+    result = fit_psf_stamps(make(10, count=12)[0], Orders(1, 0, 1.0), rules=rules)
+    assert result.status is FitStatus.POOR_FIT
+    assert "leave out those that are crowded" in result.notes[0]
+
+
+def test_a_slope_of_the_background_is_taken_off_and_told() -> None:
+    """It is that which does not grow with a star's light; hits do not count."""
+    stamps = make(11)[0]
+    assert without_slope(stamps) == (stamps, ())
+    sloped = stamps.values_e + 3.0 * (np.arange(15) - 7)
+    sloped[np.random.default_rng(4).random(sloped.shape) < 1e-3] += 5000.0
+    level, (note,) = without_slope(replace(stamps, values_e=sloped))
+    assert "slopes by (+3" in note
+    assert (sloped - level.values_e)[:, :, 14] == pytest.approx(21.0, abs=4.0)
+
+
 def test_a_background_is_fitted_and_told() -> None:
     stamps, _ = make(9)
     left = replace(stamps, values_e=stamps.values_e + 200.0 + 10.0 * np.random.default_rng(3).normal(size=(30, 1, 1)))
@@ -302,6 +334,12 @@ def test_stamps_that_no_psf_describes_are_refused() -> None:
     wild = np.where(np.random.default_rng(2).random(stamps.values_e.shape) < 0.1, 1e30, stamps.values_e)
     with pytest.raises(FitError, match="a psf can describe"):
         fit_psf_stamps(replace(stamps, values_e=wild, clip_e=1e9))
+
+
+def test_what_are_no_stamps_is_refused() -> None:
+    # Without the tests' own check of types, which programs do not have.
+    with pytest.raises(FitError, match="Expected a Stamps, found None"):
+        inspect.unwrap(fit_psf_stamps)(None)
 
 
 def test_three_stamps_are_too_few() -> None:

@@ -149,6 +149,7 @@ class StampsRules:
         parts: of the stars, of which one at a time is left out to see the errors of the others' field.
         inflate_above: reduced chi-squared above which every sigma grows with its root. Counts are skewed, so that
             their chi-squared scatters more than that of normal samples.
+        noise_off: part by which reduced chi-squared is below 1 where the noise given is too large.
         poor_above: reduced chi-squared above which the fit is poor; likewise squared errors of stars that were left
             out, in units of the expected ones.
     """
@@ -181,6 +182,7 @@ class StampsRules:
     draws: tuple[int, int] = (16, 192)
     parts: int = 4
     inflate_above: float = 1.05
+    noise_off: float = 0.1
     poor_above: float = 2.0
 
 
@@ -228,7 +230,7 @@ def backgrounds(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
 
     A psf's own light at the edge grows with a star's light, a background does not.
     """
-    far = _at_edge(stamps)
+    far = at_edge(stamps)
     out = np.zeros((len(stamps.unit), len(stamps.by_plane)))
     for plane, seen in enumerate(stamps.by_plane):
         stars = np.flatnonzero((seen & far).sum(axis=1) > 8)
@@ -253,11 +255,12 @@ def backgrounds(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
 
 def edge_light(stamps: Stamps) -> float:
     """Return the light of a sample at the stamps' edges, wings and background together, RMS over colours."""
-    light = [np.median(stamps.value_e[own]) if own.any() else 0.0 for own in stamps.by_plane & _at_edge(stamps)]
+    light = [np.median(stamps.value_e[own]) if own.any() else 0.0 for own in stamps.by_plane & at_edge(stamps)]
     return float(np.linalg.norm(light) / np.sqrt(len(light)))
 
 
-def _at_edge(stamps: Stamps) -> Bool[np.ndarray, " samples"]:
+def at_edge(stamps: Stamps) -> Bool[np.ndarray, " samples"]:
+    """Return the samples that are a stamp's border."""
     return (np.abs(stamps.offset_px) / (np.array(stamps.values_e.shape[:0:-1]) // 2)).max(axis=1) > 0.85
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
+from udccal.arguments import check_kind
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Choice
@@ -21,6 +22,7 @@ from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_
 from udccal.fitting.psf_stamps.model_error import drawn, without_error
 from udccal.fitting.psf_stamps.probability import LEAST, State, expectation
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
+from udccal.fitting.psf_stamps.slope import without_slope
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
@@ -196,10 +198,12 @@ def fit_psf_stamps(
         FitError: when there are fewer than four stamps with light, or no psf describes any of them.
     """
     rules = rules or StampsRules()
+    check_kind(stamps, Stamps, "Cut one stamp about each star, and give udccal's Stamps.", FitError)
     if len(stamps.unit) < 4:
         raise FitError(f"Expected at least 4 stamps, found {len(stamps.unit)}. Cut more of them.")
     if (lit := int((stamps.value_e > stamps.read_e).any(axis=1).sum())) < 4:
         raise FitError(f"Expected light above the noise in at least 4 stamps, found it in {lit}. Check what was cut.")
+    stamps, sloped = without_slope(stamps)
     bad, lowest = unusable(stamps, rules), Orders(0, 0, rules.spacings_px[0])
     # Stamps that determine nothing lead to numbers that are not finite, which the equations refuse.
     with np.errstate(all="ignore"):
@@ -209,7 +213,8 @@ def fit_psf_stamps(
             note = "The equations were singular; what is given is one psf for all places."
             bad = bad or (FitStatus.NOT_CONVERGED, note)
             chosen = _one_for_all(stamps, rules, lowest)
-        return _report(stamps, chosen, seed, rules, bad)
+        result = _report(stamps, chosen, seed, rules, bad)
+    return replace(result, notes=(*result.notes, *sloped))
 
 
 def _one_for_all(stamps: Stamps, rules: StampsRules, lowest: Orders) -> Choice[Found]:
@@ -270,7 +275,7 @@ def _report(
             Diagnostic("left_out_off", state.left_out_off, "1"),
             Diagnostic("background", float(state.background_e.mean()), "e-"),
         ),
-        notes=(*([note] if note else []), *_told(state)),
+        notes=(*([note] if note else []), *_told(state), *_quiet(stamps, state, z.size - effective, rules)),
         outliers=_left_out(stamps, state, rules),
         residuals=residual_sample((term.star_px[:, None] + stamps.offset_px)[used], z),
         posterior=Posterior(np.zeros(len(term.factor)), term.factor, term.changed),
@@ -285,6 +290,9 @@ def _verdict(stamps: Stamps, found: Found, chi2_dof: float, size: float, rules: 
     if off**2 > rules.poor_above * size**2:
         told = f"Stamps that were left out are off by {100 * off:.2g} %, where {100 * size:.2g} % are expected."
         return FitStatus.POOR_FIT, f"{told} Check that each stamp has its own position."
+    if not found.converged and len(found.place.field.mix) >= rules.most_images:
+        told = f"{rules.most_images} images did not describe the stamps, and error bars do not hold."
+        return FitStatus.POOR_FIT, f"{told} Check that each stamp holds one star; leave out those that are crowded."
     if not found.converged:
         left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
         return FitStatus.NOT_CONVERGED, left
@@ -318,6 +326,16 @@ def _told(state: State) -> tuple[str, ...]:
         told = "Error bars include it: the field changes more than its orders follow, or the noise given is wrong."
         notes.append(f"The psf differs from the model by {100 * error:.2g} %. {told}")
     return tuple(notes)
+
+
+def _quiet(stamps: Stamps, state: State, dof: float, rules: StampsRules) -> tuple[str, ...]:
+    """Return a note where samples scatter less than the noise given, the psf's own error apart."""
+    plain = expectation(stamps, without_error(state))
+    chi2_dof = float((plain.residual**2 * plain.weight).sum()) / max(dof, 1.0)
+    if chi2_dof > 1 - max(rules.noise_off, 6 * np.sqrt(2 / max(dof, 1.0))):
+        return ()
+    told = f"Samples scatter with {chi2_dof:.2g} times the variance of the noise given: error bars are too wide."
+    return (f"{told} Check the read noise, and that values are electrons, less the black level.",)
 
 
 def _names(state: State) -> list[str]:
