@@ -13,6 +13,7 @@ from udccal.errors import FitError
 from udccal.fitting.noise.dark import unexplained_variance
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, NoiseRules
 from udccal.fitting.noise.fit import fit_noise
+from udccal.fitting.noise.line_noise import column_noise
 from udccal.fitting.noise.moments import reduced
 from udccal.result import FitResult, FitStatus
 
@@ -132,8 +133,9 @@ def test_variance_leaves_out_hits_of_radiation() -> None:
     hit = reduced(NoiseData(data, top_code=4095), NoiseRules())
     assert clean is not None
     assert hit is not None
-    few, many = (unexplained_variance(hit, np.zeros(6), most) for most in (1e-3, 1e-5))
-    assert few.value == pytest.approx(unexplained_variance(clean, np.zeros(6), 1e-3).value, rel=1e-3)
+    columns = column_noise(clean)
+    few, many = (unexplained_variance(hit, np.zeros(6), most, columns) for most in (1e-3, 1e-5))
+    assert few.value == pytest.approx(unexplained_variance(clean, np.zeros(6), 1e-3, columns).value, rel=1e-3)
     assert many.value > 2 * few.value
 
 
