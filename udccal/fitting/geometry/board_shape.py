@@ -89,7 +89,10 @@ def _step(solved: Solved, points: Points, free: Free, dof: float) -> tuple[Shape
     slopes, by_shape, z = _linearised(solved, points, free)
     left = by_shape - slopes @ (solved.equations.joint_cov() @ (slopes.T @ by_shape))
     unit = np.maximum(np.linalg.norm(by_shape, axis=0), 1e-300)
-    values, vectors = np.linalg.eigh(by_shape.T @ left / np.outer(unit, unit))
+    information = by_shape.T @ left / np.outer(unit, unit)
+    # Corners that fit no board may lead to derivatives that are no numbers: these tell nothing.
+    sound = bool(np.isfinite(information).all())
+    values, vectors = np.linalg.eigh(information if sound else np.zeros_like(information))
     seen = values > _LEAST_SEEN
     axes = vectors[:, seen] / unit[:, None]
     along = -(left @ axes).T @ z
