@@ -70,6 +70,13 @@ def board_shape(solved: Solved, points: Points, free: Free, prior: Prior, dof: f
     """
     if len(points.names) <= points.rules.least_views:
         return None
+    try:
+        return _explaining(solved, points, free, prior, dof)
+    except np.linalg.LinAlgError:  # corners that fit no board may lead to derivatives that are no numbers
+        return None
+
+
+def _explaining(solved: Solved, points: Points, free: Free, prior: Prior, dof: float) -> BoardShape | None:
     values, cov, test = _step(solved, points, free, dof)
     if not test.found:
         return None
@@ -89,10 +96,7 @@ def _step(solved: Solved, points: Points, free: Free, dof: float) -> tuple[Shape
     slopes, by_shape, z = _linearised(solved, points, free)
     left = by_shape - slopes @ (solved.equations.joint_cov() @ (slopes.T @ by_shape))
     unit = np.maximum(np.linalg.norm(by_shape, axis=0), 1e-300)
-    information = by_shape.T @ left / np.outer(unit, unit)
-    # Corners that fit no board may lead to derivatives that are no numbers: these tell nothing.
-    sound = bool(np.isfinite(information).all())
-    values, vectors = np.linalg.eigh(information if sound else np.zeros_like(information))
+    values, vectors = np.linalg.eigh(by_shape.T @ left / np.outer(unit, unit))
     seen = values > _LEAST_SEEN
     axes = vectors[:, seen] / unit[:, None]
     along = -(left @ axes).T @ z
