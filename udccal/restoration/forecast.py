@@ -4,8 +4,8 @@ The three quicker tiers' pictures are made. What ``balanced`` takes out of that 
 much noise it leaves. Each place also gets the variance of the detail that the tile's filter loses (``lost_detail``);
 within a tile it follows the square of the light. How much detail there is where the filter finds none, the finest
 detail that it finds tells: where two octaves of it hardly differ, the scene goes on as strong. The quicker tiers differ
-from ``balanced`` by errors of their own. Errors of the profile, light that clips, and what is left of
-the light of a panel whose picture is not known, are not part of it.
+from ``balanced`` by errors of their own. Errors of the profile, light that clips, and what is left of the light of a
+panel whose picture is not known, are not part of it.
 """
 
 from __future__ import annotations

@@ -254,8 +254,8 @@ def unexplained_variance(
     It comes from the differences of the codes, and its sigma from their fourth moment and the draws of ``columns``.
     Differences taken for hits count where they are more than ``most_hits`` of all: radiation does not hit so often, so
     that they are tails of the noise, or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the
-    variance over all pixels). Pixels far
-    from the others count only where ``of_all`` is True: hot ones have shot noise, dead ones have none.
+    variance over all pixels). Pixels far from the others count only where ``of_all`` is True: hot ones have shot noise,
+    dead ones have none.
     """
     values, variances = _temporal(data, most_hits, columns, of_all)
     weights = 1.0 / variances

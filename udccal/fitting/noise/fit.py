@@ -192,10 +192,8 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     unsteady = bool(fit.values[5] * full_DN > fit.values[0])
     shared = shared_by_neighbours(data, curve)
     linked = shared.found and abs(shared.gain_factor - 1) > rules.most_shared
-    poor, converged = (
-        fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked or unsteady,
-        dark.fit.converged or dark.foreign,
-    )
+    poor = fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked or unsteady
+    converged = dark.fit.converged or dark.foreign
     status = FitStatus.CONVERGED if fit.converged and converged else FitStatus.NOT_CONVERGED
     shown = len(NAMES) - (not fit.order.curved)
     terms = (dark.row_DN2, dark.columns.DN2, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
