@@ -29,7 +29,7 @@ def _read(data: bytes) -> Profile:
     return read_profile(folder)
 
 
-def _kernels(a: Profile, b: Profile) -> tuple[np.ndarray, np.ndarray]:
+def _kernels(a: Profile, b: Profile, same: bool) -> tuple[np.ndarray, np.ndarray]:
     """Points: kernels of other sizes would be compiled for a minute."""
     point = np.zeros((4, 3, 3, 3))
     point[..., 1, 1] = 1.0
