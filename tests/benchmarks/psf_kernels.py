@@ -56,7 +56,7 @@ def light_and_slopes(
         values: Float[Array, " p"], own: Float[Array, "nodes terms rows half"] | None, light: Float[Array, "3 nodes"]
     ) -> Float[Array, "n 3"]:
         model = evaluator.model(values)
-        transfer = average_transfer(model, frame, grid, light, disc_px, rounded=evaluator.shaped)
+        transfer = average_transfer(model, frame, grid, light, disc_px, shaped=evaluator.shaped)
         if own is not None:
             transfer = transfer + interference_transfer(model, frame, grid, light, own, disc_px)
         return sample(grid, spline_coefficients(grid, transfer), jnp.asarray(points)) * jnp.asarray(density)[:, None]

@@ -56,6 +56,7 @@ def true_field(truth: RigTruth) -> PsfField:
         bar_width=np.zeros(2),
         bar_place=np.zeros(2),
         corner_radius=np.float64(0.0),
+        slant=np.zeros(2),
         pupil_diameter_mm=np.float64(optics.pupil_diameter_mm),
         blur_px=np.float64(0.0),
         blur_growth=np.zeros(2),
@@ -112,34 +113,61 @@ def test_slits_with_a_bar_against_a_sum(lag: float, width: float, place: float) 
     assert found == pytest.approx(expected, abs=4e-4)
 
 
-def overlap_at(lag: Pair, opened: Pair, width: Pair, place: Pair, corner: float) -> jax.Array:
+def overlap_at(lag: Pair, opened: Pair, width: Pair, place: Pair, corner: float, slant: Pair = (0.0, 0.0)) -> jax.Array:
     """Of openings at a lag of (columns, rows), of green light alone."""
-    slits = Slits(*(jnp.array(part) for part in (opened, width, place, (corner, corner))))
+    slits = Slits(*(jnp.array(part) for part in (opened, width, place, (corner, corner), slant)))
     model = true_field(draw_truth(load_rig("lg55-reduced"), seed=1)).diffraction
     model = replace(model, wavelengths_nm=GREEN_NM, spectrum=np.ones((3, 2)))
-    per_period = model.pitch_mm / (GREEN_NM[0] * 1e-6)
-    columns, rows = opening_overlaps(model, slits, *(jnp.array([part * per_period]) for part in lag), corner > 0)
-    return jnp.sum(columns[:, 0, 0] * rows[:, 0, 0]) / slits.open_part(corner > 0)
+    per_period, shaped = model.pitch_mm / (GREEN_NM[0] * 1e-6), max(corner, *slant) > 0
+    columns, rows = opening_overlaps(model, slits, *(jnp.array([part * per_period]) for part in lag), shaped)
+    return jnp.sum(columns[:, 0, 0] * rows[:, 0, 0]) / slits.open_part(shaped)
 
 
-@pytest.mark.parametrize("lag", [(0.0, 0.0), (0.1, 0.05), (0.2, 0.31), (-0.3, 0.8), (1.4, 0.02), (2.9, 2.95)])
+_LAGS = [(0.0, 0.0), (0.1, 0.05), (0.2, 0.31), (-0.3, 0.8), (1.4, 0.02), (2.9, 2.95)]
+
+
+@pytest.mark.parametrize("lag", _LAGS)
 @pytest.mark.parametrize(("width", "place"), [(0.0, 0.0), (0.05, 0.1), (0.06, 0.16)])
 def test_openings_with_round_corners_against_a_sum(lag: Pair, width: float, place: float) -> None:
-    opened, corner, axis = (0.8, 0.4), 0.15, (np.arange(1000) + 0.5) / 1000
+    opened, corner = (0.8, 0.4), 0.15
     across, down = (part / 2 - corner for part in opened)
 
     def open_at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        x, y = ((at + 0.5) % 1 - 0.5 for at in (x, y))
         inside, bar = (np.abs(x) < opened[0] / 2) & (np.abs(y) < opened[1] / 2), np.abs(y - place) < width / 2
         away = np.hypot(np.maximum(np.abs(x) - across, 0.0), np.maximum(np.abs(y) - down, 0.0))
         return inside & ~bar & (away < corner)
 
-    x, y = np.meshgrid(axis, axis)
-    here = open_at(x, y)
-    expected = (open_at(x + lag[0], y + lag[1]) & here).mean() / here.mean()
+    expected = summed(open_at, lag)
     found, square = (as_numpy(overlap_at)(lag, opened, (0.0, width), (0.0, place), at) for at in (corner, 0.0))
     assert found == pytest.approx(expected, abs=3e-3)
     assert abs(square - expected) > 4e-3 or max(expected, 1.0 - expected) > 0.999  # that the comparison can fail
+
+
+@pytest.mark.parametrize("lag", _LAGS)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_openings_wider_at_one_end_against_a_sum(lag: Pair, axis: int) -> None:
+    opened, slant = ((0.4, 0.8) if axis == 0 else (0.8, 0.4)), 0.12
+
+    def open_at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        across, along = (x, y) if axis == 0 else (y, x)
+        wide = opened[axis] / 2 + slant * along / opened[1 - axis]
+        return (np.abs(across) < wide) & (np.abs(along) < opened[1 - axis] / 2)
+
+    expected, none = summed(open_at, lag), (0.0, 0.0)
+    slants = (slant, 0.0) if axis == 0 else (0.0, slant)
+    found, plain = (as_numpy(overlap_at)(lag, opened, none, none, 0.0, of) for of in (slants, none))
+    assert found == pytest.approx(expected, abs=3e-3)
+    assert abs(found - expected) < 0.3 * abs(plain - expected) or abs(plain - expected) < 3e-3
+
+
+def summed(open_at: Callable[[np.ndarray, np.ndarray], np.ndarray], lag: Pair) -> float:
+    """The open part times itself moved, of what is open at places in a period, whose middle is the opening's."""
+    axis = (np.arange(1000) + 0.5) / 1000
+    here, there = (
+        open_at(*((at + 0.5) % 1 - 0.5 for at in np.meshgrid(axis + move[0], axis + move[1])))
+        for move in ((0.0, 0.0), lag)
+    )
+    return float((here & there).mean() / here.mean())
 
 
 @pytest.mark.parametrize("spread", [1e-9, 0.02, 0.3, 0.9])

@@ -27,7 +27,7 @@ from udccal.profiles.store import read_profile, write_profile
 from udccal.profiles.versions import JsonObject
 from udccal.result import FitStatus
 
-STORED: Final = {version: Path(__file__).parent / "stored" / f"version_{version}.zip" for version in (3, 4, 5, 6)}
+STORED: Final = {version: Path(__file__).parent / "stored" / f"version_{version}.zip" for version in (3, 4, 5, 6, 7)}
 # Of psf parameters, those that version 4 added.
 BLUR: Final = ("blur_growth", "blur_colour")
 
@@ -131,8 +131,8 @@ def test_what_came_later_is_as_it_was_meant_before(version: int, document: JsonO
     np.testing.assert_array_equal(profile.psf.term.diffraction.blur_growth, growth)
     np.testing.assert_array_equal(profile.psf.term.diffraction.blur_colour, colour)
     # Rows were as deep as columns, and openings were rectangles without a bar.
-    for name in ("depth_ratio", "bar_width", "bar_place", "corner_radius"):
-        assert f"diffraction.{name}" not in stored
+    for name in ("depth_ratio", "bar_width", "bar_place", "corner_radius", "slant"):
+        assert (f"diffraction.{name}" in stored) == (version >= 7 and name != "slant")
         assert not np.any(getattr(profile.psf.term.diffraction, name))
 
 
@@ -183,7 +183,7 @@ def without(term: str, name: str) -> Callable[[JsonObject], object]:
 CHANGED: Final[dict[str, tuple[Callable[[JsonObject], object], str]]] = {
     "a future version": (lambda d: d.update(version=VERSION + 1), f"newer version {VERSION + 1}"),
     "a version without a number": (lambda d: d.update(version=None), "version number"),
-    "a later version than it is": (lambda d: d.update(version=VERSION), "nonlinearity|captures.steps|depth_ratio"),
+    "a later version than it is": (lambda d: d.update(version=VERSION), "nonlinearity|captures.steps|depth_ratio|slant"),
     "no term": (lambda d: d["terms"].pop("psf"), "'terms.psf'"),
     "no fit": (lambda d: d["terms"]["wire"].pop("fit"), "'terms.wire.fit'"),
     "no captures": (lambda d: d["terms"]["noise"]["fit"].pop("captures"), "captures"),

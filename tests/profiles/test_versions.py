@@ -99,7 +99,7 @@ def written_in_version_2(folder: Path, profile: Profile) -> Path:
     document["version"], document["pictures"] = 2, document["pictures"][:3]
     noise, psf = document["terms"]["noise"], document["terms"]["psf"]
     noise["parameters"] = [one for one in noise["parameters"] if one["name"] != "nonlinearity"]
-    names = "blur_growth", "blur_colour", "depth_ratio", "bar_width", "bar_place", "corner_radius"
+    names = "blur_growth", "blur_colour", "depth_ratio", "bar_width", "bar_place", "corner_radius", "slant"
     later = {f"diffraction.{name}" for name in names}
     psf["parameters"] = [one for one in psf["parameters"] if one["name"] not in later]
     for section in document["terms"].values():

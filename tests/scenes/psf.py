@@ -15,7 +15,7 @@ from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.data import Shots, joined
 from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice
 from udccal.fitting.psf.start import cut_crop
-from udccal.models.diffraction import Diffraction, average_transfer, has_round_corners, local_frame
+from udccal.models.diffraction import Diffraction, average_transfer, is_shaped, local_frame
 from udccal.models.geometry import Geometry
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
 from udccal.models.lattice import Lattice, sample, spline_coefficients
@@ -115,13 +115,13 @@ def _light(
     place: Float[Array, "2"],
     offsets: Float[Array, "n 2"],
     grid: Lattice,
-    rounded: bool,
+    shaped: bool,
 ) -> Float[Array, "n 3"]:
     """Light per unit of a source at ``place``."""
     frame = local_frame(geometry, place)
     spectra = jnp.asarray(model.spectrum)
     overlaps = node_overlaps(model, frame, grid, overlap_tables(model, frame))
-    transfer = average_transfer(model, frame, grid, spectra, DISC_PX, rounded=rounded)
+    transfer = average_transfer(model, frame, grid, spectra, DISC_PX, shaped=shaped)
     transfer = transfer + interference_transfer(model, frame, grid, spectra, overlaps, DISC_PX)
     points, density = lattice_points(geometry, frame, place, offsets)
     return sample(grid, spline_coefficients(grid, transfer), points) * density[:, None]
@@ -146,7 +146,7 @@ def pictures(
     rows, columns = (2 * (h + _SPARE) + 1 for h in scene.half)
     # That of the fit: what a lattice of this size leaves out is no matter of efficiency.
     lattice = fit_lattice(scene.half)
-    model, made = Evaluator(WAVELENGTHS_NM, lattice, interference).model(theta), []
+    model, made = Evaluator(WAVELENGTHS_NM, lattice, interference, shaped=True).model(theta), []
     for place in scene.places_px:
         for _ in range(scene.shifts):
             aim = place + rng.uniform(0, 2, 2)
@@ -154,7 +154,7 @@ def pictures(
             corner = (np.round(aim).astype(int) - [columns // 2, rows // 2]) // 2 * 2
             y, x = np.mgrid[:rows, :columns]
             offsets = np.stack([x.ravel(), y.ravel()], axis=-1) + corner - source
-            light = np.asarray(_light(model, scene.geometry, source, offsets, lattice, has_round_corners(model)))
+            light = np.asarray(_light(model, scene.geometry, source, offsets, lattice, is_shaped(model)))
             light = light.reshape(rows, columns, 3) * FLUX
             rate = np.take_along_axis(light, cfa_named(scene.rig.camera.cfa).channel_map(rows, columns)[..., None], 2)[
                 ..., 0

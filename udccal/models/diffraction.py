@@ -8,7 +8,8 @@ R is the autocorrelation of the open part of the pupil's footprint at a lag s on
 coefficients of a row of slits times itself moved by the lag. H_gh is that of the footprint times itself moved by the
 lag. (X, Y) is the footprint's centre in pitches (Goodman, Introduction to Fourier Optics, sections 3.10, 6.3).
 The term g = h = 0 is the average over X and Y, an incoherent sum of diffraction orders. With round corners it is a sum
-of products: the opening is a pile of slits, which get narrower as a corner is cut in steps. The other terms are the
+of products: the opening is a pile of slits, which get narrower as a corner is cut in steps, as they do along an opening
+that is wider at one end. The other terms are the
 interference between neighbouring orders, which changes as the footprint slides over the rows (see ``interference``).
 Direction cosines along the panel make this exact at any angle: the geometry adds stretch and conical bending.
 """
@@ -31,8 +32,8 @@ from udccal.models.slits import Slits, inside_opening, slit_coefficients, window
 _FINE_NM = 5.0
 # Bars narrower than this are none, in periods.
 _LEAST_BAR = 1e-3
-# Corners with a smaller radius are none, in periods.
-_LEAST_CORNER = 1e-3
+# Corners with a smaller radius, and smaller slants, are none, in periods.
+_LEAST_SHAPE = 1e-3
 PUPIL_NODES = 4
 
 
@@ -48,6 +49,7 @@ class Diffraction(eqx.Module):
             normal; none below a thousandth. Its depth is theirs.
         bar_place: distance of the bar's middle from the opening's, in periods; kernels do not tell its sign.
         corner_radius: that of the openings' round corners, in periods.
+        slant: by how much openings of (columns, rows) are wider at one end than in their middle, in periods.
         pupil_diameter_mm: diameter of the entrance pupil.
         offset_periods: centre (X, Y) of the footprint of a ray along the normal, in periods from the middle of an
             opening, modulo 1.
@@ -68,6 +70,7 @@ class Diffraction(eqx.Module):
     bar_width: Float[Arrayish, "2"]
     bar_place: Float[Arrayish, "2"]
     corner_radius: Float[Arrayish, ""]
+    slant: Float[Arrayish, "2"]
     pupil_diameter_mm: Float[Arrayish, ""]
     offset_periods: Float[Arrayish, "2"]
     standoff_per_pitch: Float[Arrayish, ""]
@@ -122,7 +125,7 @@ def average_transfer(
     spectra: Float[Array, "3 nodes"],
     disc_px: Float[Arrayish, ""] = 0.0,
     *,
-    rounded: bool,
+    shaped: bool,
 ) -> Float[Array, "3 rows half"]:
     """Return transfer functions averaged over the footprint's place: the term g = h = 0, pixel included.
 
@@ -132,12 +135,12 @@ def average_transfer(
         lattice: lattice in panel directions around the source.
         spectra: light of each colour at the model's wavelength nodes.
         disc_px: diameter of a round source on the sensor; 0 for a point.
-        rounded: False leaves round corners out, which saves time.
+        shaped: False leaves round corners and slants out, which saves time.
     """
     fx, fy = lattice_frequencies(frame, lattice)
     slits = slits_along(model, frame)
-    columns, rows = opening_overlaps(model, slits, fx, fy, rounded)
-    rows = rows / slits.open_part(rounded)
+    columns, rows = opening_overlaps(model, slits, fx, fy, shaped)
+    rows = rows / slits.open_part(shaped)
 
     def add(
         total: Float[Array, "3 rows half"], anchor: tuple[Array, Array]
@@ -185,12 +188,16 @@ def slits_along(model: Diffraction, frame: LocalFrame) -> Slits:
     opened, bar, place = (jnp.asarray(part) for part in (model.openings, model.bar_width, model.bar_place))
     opened, bar = jnp.clip(opened - shadow, 0.02, 1.0), jnp.where(bar > _LEAST_BAR, bar + shadow, 0.0)
     # Beyond a half, corners are half-circles; a little more leaves the radius a derivative there.
-    return Slits(opened, *inside_opening(opened, bar, place), jnp.clip(model.corner_radius, 0.0, 0.6 * opened))
+    corners, slant = jnp.clip(model.corner_radius, 0.0, 0.6 * opened), jnp.clip(jnp.asarray(model.slant), 0.0, opened)
+    return Slits(opened, *inside_opening(opened, bar, place), corners, slant)
 
 
-def has_round_corners(model: Diffraction) -> bool:
-    """Return whether openings have round corners, which take longer to compute; a traced radius may be any."""
-    return isinstance(model.corner_radius, jax.core.Tracer) or float(model.corner_radius) > _LEAST_CORNER
+def is_shaped(model: Diffraction) -> bool:
+    """Return whether openings have round corners or slants, which take longer to compute; traced ones may be any."""
+    shape = model.corner_radius, model.slant
+    if any(isinstance(part, jax.core.Tracer) for part in shape):
+        return True
+    return max(float(np.max(np.asarray(part))) for part in shape) > _LEAST_SHAPE
 
 
 def relative_lag(
@@ -210,37 +217,44 @@ def disc_autocorrelation(relative_lag: Float[Arrayish, "*n"]) -> Float[Array, "*
 
 
 def opening_overlaps(
-    model: Diffraction, slits: Slits, fx: Float[Array, " half"], fy: Float[Array, " rows"], rounded: bool
+    model: Diffraction, slits: Slits, fx: Float[Array, " half"], fy: Float[Array, " rows"], shaped: bool
 ) -> tuple[Float[Array, "parts half nodes"], Float[Array, "parts rows nodes"]]:
     """Return the open part times itself moved, averaged over the light of each wavelength node, by columns and rows.
 
     The sum over parts of one times the other is that of a period, relative to an opening with square corners: at no lag
-    it is ``Slits.open_part``. Without round corners there is one part. With them the opening is a pile of slits: those
-    of rows that each step leaves, by the columns that it opens in addition.
+    it is ``Slits.open_part``. A plain opening has one part. With round corners the opening is a pile of slits: those of
+    rows that each step leaves, by the columns that it opens in addition. Slants add parts of their own.
 
     Args:
         model: the diffraction term.
         slits: along the source's ray.
         fx: cycles per unit direction cosine along x, for the columns. fy: along y, for the rows.
-        rounded: whether the openings' corners may be round.
+        shaped: whether the openings' corners may be round, and their sides slanted.
     """
-    nodes, levels = jnp.asarray(model.wavelengths_nm) * (1e-6 / model.pitch_mm), slits.levels(rounded)
+    nodes, levels = jnp.asarray(model.wavelengths_nm) * (1e-6 / model.pitch_mm), slits.levels(shaped)
 
-    def pairs(axis: int, frequency: Float[Array, " n"]) -> Float[Array, "levels levels n nodes"]:
-        # A node's light is a triangle as wide as its distance to its neighbours.
-        lag, spread = frequency[:, None] * nodes, jnp.abs(frequency)[:, None] * (nodes[1] - nodes[0])
+    # A node's light is a triangle as wide as its distance to its neighbours.
+    lags = [(f[:, None] * nodes, jnp.abs(f)[:, None] * (nodes[1] - nodes[0])) for f in (fx, fy)]
+    lit = slits.opened - slits.bar_width
+
+    def pairs(axis: int) -> Float[Array, "levels levels n nodes"]:
+        lag, spread = lags[axis]
         opened, bar, place = (part[:, axis, None, None, None] for part in levels)
         other, other_bar, other_place = (jnp.swapaxes(part, 0, 1) for part in (opened, bar, place))
         both = window_overlap(opened, other, lag, spread)
         both += window_overlap(bar, other_bar, lag + other_place - place, spread)
         both -= window_overlap(opened, other_bar, lag + other_place, spread)
         both -= window_overlap(other, bar, lag - place, spread)
-        return both / (slits.opened[axis] - slits.bar_width[axis])
+        return both
 
-    columns, rows = pairs(0, fx), pairs(1, fy)[::-1, ::-1]
+    columns, rows = pairs(0), pairs(1)[::-1, ::-1]
     for axis in (0, 1):
         columns = -jnp.diff(columns, axis=axis, append=0.0)
-    return columns.reshape(-1, *columns.shape[2:]), rows.reshape(-1, *rows.shape[2:])
+    columns, rows = (part.reshape(-1, *part.shape[2:]) for part in (columns, rows))
+    if shaped:
+        wide, tall = slits.slanted(0, *lags), slits.slanted(1, *lags[::-1])
+        columns, rows = jnp.concatenate([columns, wide[0], tall[1]]), jnp.concatenate([rows, wide[1], tall[0]])
+    return columns / lit[0], rows / lit[1]
 
 
 def slits_of(
@@ -250,7 +264,7 @@ def slits_of(
 
     A node's light is a triangle as wide as its distance to its neighbours. High orders therefore smear into a
     continuum, as they do in daylight, without a node for every nanometre. Coefficients above order 0 are summed in
-    steps of some nanometres and leave bars out: they move a hundredth of the light, and a bar changes a part of that.
+    steps of some nanometres and are those of plain openings: they move a hundredth of the light.
 
     Args:
         model: the diffraction term.

@@ -20,7 +20,7 @@ from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
     average_transfer,
-    has_round_corners,
+    is_shaped,
     local_frame,
     node_scale,
 )
@@ -75,16 +75,16 @@ def psf_kernels(
         positions_px: (x, y) of each source on the sensor, which is the centre of the kernel's middle sample.
         rows: odd number of rows. columns: odd number of columns.
     """
-    return _kernels(field, jnp.asarray(positions_px), rows, columns, has_round_corners(field.diffraction))
+    return _kernels(field, jnp.asarray(positions_px), rows, columns, is_shaped(field.diffraction))
 
 
 @eqx.filter_jit
 def _kernels(
-    field: PsfField, positions_px: Float[Array, "n 2"], rows: int, columns: int, rounded: bool
+    field: PsfField, positions_px: Float[Array, "n 2"], rows: int, columns: int, shaped: bool
 ) -> Float[Array, "n 3 rows columns"]:
     def one(position: Float[Array, "2"]) -> Float[Array, "3 rows columns"]:
         kernel = field.diffraction_fraction * diffraction_kernel(
-            field.diffraction, field.geometry, position, rows, columns, field.fine, rounded
+            field.diffraction, field.geometry, position, rows, columns, field.fine, shaped
         ) + residual_kernel(field, position, rows, columns)
         return kernel / jnp.sum(kernel, axis=(1, 2), keepdims=True)
 
@@ -109,7 +109,7 @@ def diffraction_kernel(
     rows: int,
     columns: int,
     fine: int,
-    rounded: bool,
+    shaped: bool,
 ) -> Float[Array, "3 rows columns"]:
     """Return the kernel by diffraction alone, as a fraction of all the source's light."""
     frame = local_frame(geometry, position_px)
@@ -118,7 +118,7 @@ def diffraction_kernel(
     offsets = jnp.stack([x.ravel(), y.ravel()], axis=-1) * 1.0
     points, density = lattice_points(geometry, frame, position_px, offsets)
     size_px = (max(rows, _LEAST_PX), max(columns, _LEAST_PX))
-    values = _cross(lambda grid: average_transfer(model, frame, grid, spectra, rounded=rounded), points, size_px, fine)
+    values = _cross(lambda grid: average_transfer(model, frame, grid, spectra, shaped=shaped), points, size_px, fine)
     close_y, close_x = (min(size, most) * _MARGIN for size, most in zip(size_px, _INTERFERENCE_PX, strict=True))
     grid = lattice_for(close_y, close_x, _INTERFERENCE_PER_PX, _INTERFERENCE_PER_PX)
     overlaps = node_overlaps(model, frame, grid, overlap_tables(model, frame))

@@ -1,8 +1,9 @@
-"""A period of a panel along a ray: its open part, a bar in it, round corners, and overlaps of rows of such slits."""
+"""A period of a panel along a ray: its open part, a bar in it, its shape, and overlaps of rows of such slits."""
 
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,6 +13,12 @@ from udccal.models.bessel import sine_cosine
 # A round corner is cut in five steps, at these parts of its radius along either axis. Orders down to a ten-thousandth
 # of the brightest one have the right light to 4 % RMS where the radius is 0.15 of a period, and to 14 % at 0.2.
 _STEPS = (0.0, 0.056, 0.179, 0.335, 0.545, 0.803)
+# A slanted opening is cut across in four slits, whose widths differ from the middle's by these parts of the slant.
+_SLANTED = (-0.75, -0.25, 0.25, 0.75)
+# Of its length, round corners take so many radii at both ends together; what is left slants.
+_ENDS = 1.5
+# A row of slits in lags of periods, and the half of the triangles that they are averaged over.
+Lags = tuple[Float[Array, "_ nodes"], Float[Array, "_ 1"]]
 
 
 class Slits(eqx.Module):
@@ -21,26 +28,52 @@ class Slits(eqx.Module):
         opened: width of the opening in periods, the bar included.
         bar_width, bar_place: width of the bar, and distance of its middle from the opening's, in periods.
         corner_radius: on (columns, rows) in periods; smaller where an opening is narrow.
+        slant: by how much openings of (columns, rows) are wider at one end than in their middle, in periods.
     """
 
     opened: Float[Arrayish, "2"]
     bar_width: Float[Arrayish, "2"]
     bar_place: Float[Arrayish, "2"]
     corner_radius: Float[Arrayish, "2"]
+    slant: Float[Arrayish, "2"]
 
     def levels(
-        self, rounded: bool
+        self, shaped: bool
     ) -> tuple[Float[Array, "levels 2"], Float[Array, "levels 2"], Float[Array, "levels 2"]]:
         """Return open width, and width and place of the bar, at the steps of round corners, the widest first."""
-        opened = self.opened - 2.0 * jnp.array(_STEPS if rounded else _STEPS[:1])[:, None] * self.corner_radius
+        opened = self.opened - 2.0 * jnp.array(_STEPS if shaped else _STEPS[:1])[:, None] * self.corner_radius
         return opened, *inside_opening(opened, self.bar_width, self.bar_place)
 
-    def open_part(self, rounded: bool) -> Float[Array, ""]:
+    def open_part(self, shaped: bool) -> Float[Array, ""]:
         """Return what corners leave of the opening's area."""
-        opened, bar_width, _ = self.levels(rounded)
+        opened, bar_width, _ = self.levels(shaped)
         columns, rows = jnp.moveaxis(opened - bar_width, 1, 0)
         # Where rows are open least, columns are open most.
         return jnp.sum((columns - jnp.append(columns[1:], 0.0)) * rows[::-1]) / (columns[0] * rows[0])
+
+    def slanted(self, axis: int, across: Lags, along: Lags) -> tuple[Array, Array]:
+        """Return what a slant adds to the overlap of openings with themselves moved.
+
+        Slits of a slanted opening overlap those next to them by their widths, and lie a quarter of the length apart.
+
+        Args:
+            axis: of the slant, 0 where columns are wider at one end.
+            across: lags along that axis. along: lags along the other one.
+
+        Returns:
+            parts across and along: the sum of their products is the slanted opening's overlap less a rectangle's.
+        """
+        other = 1 - axis
+        length, wide = self.opened[other] - _ENDS * self.corner_radius[other], self.opened[axis]
+        # Held, so that the parts across depend on their own axis alone.
+        straight = jax.lax.stop_gradient(length / self.opened[other])
+        widths = (wide + straight * self.slant[axis] * jnp.array(_SLANTED))[:, None, None]
+        quarter, count = length / len(_SLANTED), len(_SLANTED)
+        sides = [jnp.sum(window_overlap(widths[: count - n], widths[n:], *across), axis=0) for n in range(count)]
+        ends = [window_overlap(quarter, quarter, along[0] + n * quarter, along[1]) for n in range(1 - count, count)]
+        ends = [ends[count - 1], *(ends[count - 1 - n] + ends[count - 1 + n] for n in range(1, count))]
+        whole = -window_overlap(wide, wide, *across), window_overlap(length, length, *along)
+        return jnp.stack([*sides, whole[0]]), jnp.stack([*ends, whole[1]])
 
 
 def inside_opening(

@@ -34,6 +34,8 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "blur_blue": "blur_colour.2",
             "column_bar_width": "bar_width.0",
             "row_bar_width": "bar_width.1",
+            "column_slant": "slant.0",
+            "row_slant": "slant.1",
         },
     }
 )

@@ -97,6 +97,7 @@ RANGES: Mapping[type, Mapping[str, Range]] = {
         "bar_width": Real(-1.0, 1.0, (2,)),
         "bar_place": Real(-1.0, 1.0, (2,)),
         "corner_radius": Real(-1.0, 1.0),
+        "slant": Real(-1.0, 10.0, (2,)),
         "pupil_diameter_mm": Real(1e-3, 1e3),
         "offset_periods": Real(-1e6, 1e6, (2,)),
         "standoff_per_pitch": Real(-1e6, 1e6),

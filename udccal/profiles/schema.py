@@ -11,7 +11,7 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import Sha256, StoredCamera
 
 FORMAT: Final = "udccal-profile"
-VERSION: Final = 7
+VERSION: Final = 8
 # Arrays of at most this many values are stored in profile.json, where a person can read and compare them.
 INLINE_VALUES = 512
 
@@ -248,7 +248,7 @@ class StoredProfile(_Strict):
     """The whole of ``profile.json``."""
 
     format: Literal["udccal-profile"]
-    version: Literal[7]
+    version: Literal[8]
     rig: RigDescription
     lineage: Lineage
     provenance: Provenance

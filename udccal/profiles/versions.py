@@ -163,6 +163,11 @@ def _sixth_to_seventh(found: JsonObject) -> JsonObject:
     return {**_with_zeros(found, "diffraction.depth_mm", new), "version": 7}
 
 
+def _seventh_to_eighth(found: JsonObject) -> JsonObject:
+    """Say that openings are as wide at either end, as it was before."""
+    return {**_with_zeros(found, "diffraction.corner_radius", (("slant", (2,)),)), "version": 8}
+
+
 # By the version that a function starts from; it returns the next version.
 MIGRATIONS: Mapping[int, Migration] = {
     1: _first_to_second,
@@ -171,6 +176,7 @@ MIGRATIONS: Mapping[int, Migration] = {
     4: _fourth_to_fifth,
     5: _fifth_to_sixth,
     6: _sixth_to_seventh,
+    7: _seventh_to_eighth,
 }
 
 

@@ -14,7 +14,7 @@ from udccal.fitting.psf.image import make_windows
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice
 from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.start import pack, read_psf
-from udccal.models.diffraction import has_round_corners
+from udccal.models.diffraction import is_shaped
 from udccal.models.fields import polynomial_basis
 from udccal.models.psf import PsfField
 from udccal.numerics import in_float64
@@ -125,7 +125,7 @@ def _compared(term: PsfField, shots: Shots, model_error: float, rules: PsfRules)
     """The pictures beside those by the term, at the best places and light of the LEDs."""
     model = term.diffraction
     nodes, lattice = np.asarray(model.wavelengths_nm), fit_lattice(shots.half)
-    evaluator = Evaluator(nodes, lattice, bool(model.visibility), has_round_corners(model))
+    evaluator = Evaluator(nodes, lattice, bool(model.visibility), is_shaped(model))
     error = max(model_error, rules.first_model_error)
     sources, explained = explain(evaluator, pack(model), shots, term.geometry, error)
     unit = (shots.positions_px() - np.asarray(term.centre_px)) / np.asarray(term.half_px)

@@ -1,4 +1,4 @@
-"""Round corners of the panel's openings and an opaque bar through them are found where they are, and only there."""
+"""The shape of the panel's openings, and an opaque bar through them, are found where they are, and only there."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.scenes.psf import pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction
 from udccal.fitting.psf.fit import _estimates
-from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, CORNER, DEPTH_RATIO
+from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, CORNER, DEPTH_RATIO, SLANT
 from udccal.fitting.psf.start import start_model, start_prior
 from udccal.numerics import in_float64
 
@@ -19,13 +19,17 @@ _RATIO = 0.25
 
 
 @in_float64
-def fitted(axis: int, width: float, place: float, corner: float = 0.0) -> tuple[DiffractionFit, np.ndarray]:
+def fitted(
+    axis: int, width: float, place: float, corner: float = 0.0, slant: float = 0.0
+) -> tuple[DiffractionFit, np.ndarray]:
     """A fit to pictures by a panel with such openings, and with rows deeper than columns; its true parameters."""
     scene = small_scene(positions=(3, 2), shifts=2, half=(24, 10))
     start = start_model(scene.rig, scene.geometry, scene.wire)
     prior = start_prior(scene.rig, start)
     rng, true = np.random.default_rng(5), prior.mean.copy()
     true[DEPTH_RATIO], true[BAR_WIDTH][axis], true[BAR_PLACE][axis], true[CORNER] = _RATIO, width, place, corner
+    if slant:
+        true[SLANT][axis] = np.log(slant)
     shots = shots_of(scene, pictures(scene, true, rng), rng)
     rules = replace(PsfRules(), close_px=scene.half)
     return fit_diffraction(shots, scene.geometry, start, prior, rules), true
@@ -53,6 +57,9 @@ def test_a_bar_is_found_with_its_width_and_place(axis: int, width: float, place:
     assert abs(fit.theta[DEPTH_RATIO] - _RATIO) < 4.5 * sigma[DEPTH_RATIO]
 
 
+_SHAPES_TRIED = ["plain openings (BIC)", "round corners and slants (BIC)"]
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize("corner", [0.08, 0.15])
 def test_round_corners_are_found_with_their_radius(corner: float) -> None:
@@ -61,11 +68,29 @@ def test_round_corners_are_found_with_their_radius(corner: float) -> None:
     assert fit.bar_axis is None
     assert fit.shape is not None
     # A bar was not looked for: openings with round corners fit.
-    assert [one.name for one in fit.shape.tried] == ["plain openings (BIC)", "round corners (BIC)"]
-    radius = _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0][-2]
-    assert radius.name == "corner_radius"
+    assert [one.name for one in fit.shape.tried] == _SHAPES_TRIED
+    numbers = {one.name: one for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
+    radius = numbers["corner_radius"]
     assert abs(radius.value - corner) < 4.5 * radius.sigma
     assert radius.sigma < 0.1 * corner
+    # What is not there is small, and does not seem to be sure.
+    assert all(numbers[f"{of}_slant"].value < 4.5 * numbers[f"{of}_slant"].sigma for of in ("column", "row"))
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("axis", [0, 1])
+def test_slants_are_found(axis: int) -> None:
+    fit, _ = fitted(axis, 0.0, 0.0, slant=0.08)
+    assert fit.converged
+    assert fit.bar_axis is None
+    assert fit.shape is not None
+    assert [one.name for one in fit.shape.tried] == _SHAPES_TRIED
+    numbers = {one.name: one for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
+    slant, other = (numbers[f"{of}_slant"] for of in (("column", "row") if axis == 0 else ("row", "column")))
+    assert abs(slant.value - 0.08) < 4.5 * slant.sigma
+    assert slant.sigma < 0.008
+    assert other.value < 4.5 * other.sigma
+    assert numbers["corner_radius"].value < 4.5 * numbers["corner_radius"].sigma
 
 
 @pytest.mark.medium

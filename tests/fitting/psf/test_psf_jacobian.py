@@ -14,10 +14,10 @@ from udccal.fitting.psf.data import PsfData, PsfRules, Shots
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.kernel import (
     BAR_WIDTH,
-    CORNER,
     HEAD,
     PITCH,
     PUPIL,
+    SLANT,
     WAVELENGTHS_NM,
     Evaluator,
     fit_lattice,
@@ -32,8 +32,8 @@ from udccal.rig import RigDescription
 _HALF = (8, 6)
 # Forward and backward, of each parameter before the spectra.
 _LENS = [1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3]
-_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, *_LENS, 1e-3, *4 * [1e-5], 1e-4, 1e-4, 1e-4, 1e-4])
-_SHAPE = slice(BAR_WIDTH.start, CORNER + 1)
+_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, *_LENS, 1e-3, *4 * [1e-5], *6 * [1e-4]])
+_SHAPE = slice(BAR_WIDTH.start, SLANT.stop)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def slopes_both_ways(
 ) -> tuple[np.ndarray, np.ndarray]:
     problem = problem_of(scene, prior, shots, interference)
     one, theta, evaluator = problem.samples.at(0), prior.mean.copy(), replace(problem.evaluator, shaped=shaped)
-    theta[_SHAPE] = np.array([0.03, 0.05, 0.1, -0.08, 0.12]) * shaped
+    theta[_SHAPE] = np.array([0.03, 0.05, 0.1, -0.08, 0.12, np.log(0.03), np.log(0.02)]) * shaped
     made, chain = (np.asarray(p) for p in evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps))
     by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
     found = np.einsum("yxfc,fcp->pyxc", by_factor, chain)

@@ -1,12 +1,13 @@
 """First descents of a fit of diffraction: from the prior's mean to near the minimum.
 
-Where plain openings do not fit, round corners are looked for, and then an opaque bar, such as a wire of the panel.
-Corners of a tenth of a period and bars of a few hundredths change kernels by ten per cent and more. A bar's place has
-several minima: descents begin at some places on each axis.
+Where plain openings do not fit, round corners and slants are looked for, and then an opaque bar, such as a wire of the
+panel. Corners of a tenth of a period and bars of a few hundredths change kernels by ten per cent and more. A bar's
+place has several minima: descents begin at some places on each axis.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Final, final
@@ -17,13 +18,25 @@ from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import PsfRules
-from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, CORNER, FOOTPRINT, OPENINGS, PUPIL, Own, Samples, Theta
+from udccal.fitting.psf.kernel import (
+    BAR_PLACE,
+    BAR_WIDTH,
+    CORNER,
+    FOOTPRINT,
+    OPENINGS,
+    PUPIL,
+    SLANT,
+    Own,
+    Samples,
+    Theta,
+)
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
 from udccal.numerics import in_two_threads
 
 _AXES: Final = ("columns", "rows")
-# Parameters that a bar has.
+# Parameters that a bar has, and that corners and slants have.
 _OF_BAR: Final = 2
+_OF_SHAPE: Final = 3
 # Of the prior: a chance that drawn rigs do not have.
 _FAR_SIGMA = 4.0
 
@@ -45,14 +58,14 @@ class Approach:
         """As an order that BIC compares to others."""
         prior = self.problem.prior
         bars = [f"a bar through openings of {_AXES[axis]}" for axis in np.flatnonzero(prior.mean[BAR_WIDTH])]
-        corners = ["round corners"] * bool(prior.mean[CORNER])
-        unknowns = self.problem.unknowns + len(corners) + _OF_BAR * len(bars)
+        corners = ["round corners and slants"] * bool(prior.mean[CORNER])
+        unknowns = self.problem.unknowns + _OF_SHAPE * len(corners) + _OF_BAR * len(bars)
         criterion = bic(self.end.equations.cost, float(unknowns), self.problem.used)
         return Attempt(f"{', '.join([*corners, *bars]) or 'plain openings'} (BIC)", unknowns, criterion, self)
 
 
 def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
-    """Return the approach with plain openings, with round corners, or with a bar in addition: the likeliest by BIC.
+    """Return the likeliest approach by BIC: plain openings, round corners and slants, or a bar in addition.
 
     Each is looked for where what came before it does not fit.
     """
@@ -119,12 +132,13 @@ def _with_bar(problem: DiffractionProblem, own: Own, rules: PsfRules) -> Approac
 
 
 def shaped_prior(prior: Prior, rules: PsfRules, bar: tuple[int, float] | None = None) -> Prior:
-    """Return the ``prior`` of plain openings, with round corners and perhaps a bar at a place (periods) on an axis.
+    """Return a ``prior`` of plain openings with round corners and slants, and perhaps a bar at a place on an axis.
 
     The openings have the rig's whole tolerances again: the wire has measured them as if they were plain.
     """
     mean, root = prior.mean.copy(), prior.root.copy()
     shape = [(CORNER, rules.corner, rules.corner)]
+    shape += [(SLANT.start + axis, math.log(rules.slant), rules.slant_log_sigma) for axis in (0, 1)]
     if bar is not None:
         axis, place = bar
         shape.append((BAR_WIDTH.start + axis, rules.bar_width, rules.bar_sigma[0]))

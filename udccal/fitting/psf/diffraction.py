@@ -47,7 +47,7 @@ class DiffractionFit:
         shots: the data, at the places that the samples are about.
         model_error: as a fraction of the peak, see ``data.left_out``; 0 where the residuals are noise.
         iterations: sum over all descents.
-        shape: comparison by BIC of plain openings, round corners, and these with an opaque bar.
+        shape: comparison by BIC of plain openings, round corners and slants, and these with an opaque bar.
         phase: comparison by BIC of a kernel with the wire's phase to one averaged over it; None where no wire was
             seen. The fits are the phase's strength in the kernel (1 where it agrees with the wire, 0 where the kernel
             does not show it) and its sigma.
@@ -74,9 +74,9 @@ class DiffractionFit:
         return int(axes[0]) if axes.size else None
 
     @property
-    def corner_radius(self) -> float | None:
-        """In periods; None where the openings' corners are square."""
-        return max(float(self.theta[CORNER]), 0.0) if self.problem.prior.mean[CORNER] else None
+    def shaped(self) -> bool:
+        """True where the openings have round corners and slants."""
+        return bool(self.problem.prior.mean[CORNER])
 
     @property
     def converged(self) -> bool:

@@ -33,7 +33,7 @@ from udccal.fitting.psf.held_out import (
     with_support,
 )
 from udccal.fitting.psf.image import Magnitude
-from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, BLUR, CORNER, PITCH
+from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, BLUR, CORNER, PITCH, SLANT
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.start import as_numpy, pitch_tolerance, some_shots, start_model, start_prior
@@ -50,8 +50,9 @@ from udccal.rig import RigDescription
 _DIFFRACTION: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm")
 _BLUR: Final = ("blur_px", "blur_growth_radial", "blur_growth_tangential", "blur_red", "blur_blue")
 _NUMBERS: Final = (*_DIFFRACTION, *_BLUR, "depth_ratio")
-# Of a bar through openings of (columns, rows) and of round corners, where there are such.
-SHAPE: Final = ("column_bar_width", "row_bar_width", "column_bar_place", "row_bar_place", "corner_radius")
+# Of a bar through openings of (columns, rows), of round corners and of slants, where there are such.
+_BAR: Final = ("column_bar_width", "row_bar_width", "column_bar_place", "row_bar_place")
+SHAPE: Final = (*_BAR, "corner_radius", "column_slant", "row_slant")
 _NAMES: Final = (*_NUMBERS, *SHAPE)
 # Diagnostics that say what sigma would be if the model had no deviation; of these numbers.
 NOISE_SIGMA: Final = "noise_sigma_"
@@ -59,6 +60,8 @@ NOISE_SIGMA: Final = "noise_sigma_"
 _UNITS: Final = dict.fromkeys(("support_rows", "support_columns"), "px") | {
     f"{NOISE_SIGMA}{name}": "mm" for name in ("depth_mm", "pupil_diameter_mm")
 }
+_AXES: Final = ("columns", "rows")
+_SLANTS: Final = range(SLANT.start, SLANT.stop)
 Cov = Float[np.ndarray, "p p"]
 _LENGTHS: Final = np.isin(_NAMES, ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
 
@@ -224,12 +227,13 @@ def _estimates(
     prior, found = fit.problem.prior, _numbers_found(fit)
     names = [_NAMES[number] for number in found]
     values, known, sigma, unit = *(v[found] for v in (fit.theta, prior.mean, prior.sigma)), np.ones(len(found))
-    # The fit's own parameter is the logarithm of the blur.
-    values[BLUR], known[BLUR] = np.exp([values[BLUR], known[BLUR]])
-    unit[BLUR], sigma[BLUR] = values[BLUR], sigma[BLUR] * known[BLUR]
+    # The fit's own parameters are logarithms of the blur and of slants.
+    logs = np.isin(found, (BLUR, *_SLANTS))
+    values, known = (np.where(logs, np.exp(np.where(logs, part, 0.0)), part) for part in (values, known))
+    unit, sigma = np.where(logs, values, unit), np.where(logs, sigma * known, sigma)
     # Kernels do not tell on which side of the opening's middle a bar is.
     values = np.where(np.isin(found, range(BAR_PLACE.start, BAR_PLACE.stop)), np.abs(values), values)
-    values = np.where(np.equal(found, CORNER), fit.corner_radius or 0.0, values)
+    values = np.where(np.equal(found, CORNER), np.maximum(values, 0.0), values)
     # The fit holds the pitch: its tolerance scales all lengths.
     sigma[PITCH] = known[PITCH] * tolerance
     by_pitch = np.where(_LENGTHS[found], values, 0.0) * tolerance
@@ -240,9 +244,9 @@ def _estimates(
 
 
 def _numbers_found(fit: DiffractionFit) -> list[int]:
-    """Return the indices of the numbers that the fit has determined; those of bar and corners where there are such."""
+    """Return the indices of the numbers that the fit has determined; those of a bar and of shapes if there are such."""
     bar = () if fit.bar_axis is None else (BAR_WIDTH.start + fit.bar_axis, BAR_PLACE.start + fit.bar_axis)
-    return [*range(len(_NUMBERS)), *bar, *([] if fit.corner_radius is None else [CORNER])]
+    return [*range(len(_NUMBERS)), *bar, *([CORNER, *_SLANTS] if fit.shaped else [])]
 
 
 def _posterior(
@@ -286,6 +290,12 @@ def _said_to_be_off(stated: KernelError, magnitude: Magnitude) -> str:
     return f"The kernel is off by {whole:.2g} % {where} by {faint:.2g} %; sigmas include that."
 
 
+def _shape_found(theta: Float[np.ndarray, " p"]) -> str:
+    wider = " and ".join(f"{part:.3f} (those of {of})" for part, of in zip(np.exp(theta[SLANT]), _AXES, strict=True))
+    radius = max(float(theta[CORNER]), 0.0)
+    return f"The openings' corners have a radius of {radius:.3f} of a period; at one end they are wider by {wider}."
+
+
 def _notes(
     data: PsfData, fit: DiffractionFit | None, pattern_p: float, off: str, support: tuple[str, ...]
 ) -> tuple[str, ...]:
@@ -299,10 +309,10 @@ def _notes(
         notes = ["cov leaves out spectra and field coefficients of the residual."]
         notes += ["chi2_dof is of the fit of diffraction and allows for the model error of its residuals."]
         if fit.bar_axis is not None:
-            of, wide = ("columns", "rows")[fit.bar_axis], fit.theta[BAR_WIDTH][fit.bar_axis]
+            of, wide = _AXES[fit.bar_axis], fit.theta[BAR_WIDTH][fit.bar_axis]
             notes += [f"A bar {wide:.3f} of a period wide crosses the openings of {of}, such as a wire of the panel."]
-        if fit.corner_radius is not None:
-            notes += [f"The openings' corners have a radius of {fit.corner_radius:.3f} of a period."]
+        if fit.shaped:
+            notes += [_shape_found(fit.theta)]
     notes += [off] if off else []
     if data.doubted:
         notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")

@@ -55,11 +55,12 @@ WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 # Nodes of a fit's lattice to a pixel.
 PER_PX: Final = 4
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
-# in mm, the logarithm of the blur in px, bars of (columns, rows), round corners, and the footprint's place on columns
-# and rows with its stand-off, in pitches.
-HEAD: Final = 19
+# in mm, the logarithm of the blur in px, bars of (columns, rows), round corners, the logarithms of slants of (columns,
+# rows), and the footprint's place on columns and rows with its stand-off, in pitches.
+HEAD: Final = 21
 PITCH, PUPIL, BLUR, GROWTH, BLUR_RED, BLUR_BLUE, DEPTH_RATIO = 0, 4, 5, slice(6, 8), 8, 9, 10
-OPENINGS, BAR_WIDTH, BAR_PLACE, CORNER, FOOTPRINT = slice(1, 3), slice(11, 13), slice(13, 15), 15, slice(16, 19)
+OPENINGS, BAR_WIDTH, BAR_PLACE, CORNER = slice(1, 3), slice(11, 13), slice(13, 15), 15
+SLANT, FOOTPRINT = slice(16, 18), slice(18, 21)
 OWN: Final = 6
 _PER_SAMPLE = ("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps")
 # Parameters of diffraction; own parameters and light of the shots, of one position or of all.
@@ -81,8 +82,8 @@ class Evaluator(eqx.Module):
         wavelengths_nm: nodes of the spectra.
         lattice: of kernels.
         interference: whether the footprint's place on rows is known.
-        shaped: whether openings may have bars and round corners. Without, corners are left out and bars have no
-            derivatives, which saves time.
+        shaped: whether openings may have bars, round corners and slants. Without, the latter two are left out and bars
+            have no derivatives, which saves time.
     """
 
     wavelengths_nm: Float[Arrayish, " nodes"]
@@ -100,7 +101,8 @@ class Evaluator(eqx.Module):
             depth_ratio=theta[DEPTH_RATIO],
             bar_width=theta[BAR_WIDTH],
             bar_place=theta[BAR_PLACE],
-            corner_radius=theta[CORNER],
+            corner_radius=jnp.maximum(theta[CORNER], 0.0),
+            slant=jnp.exp(theta[SLANT]) if self.shaped else jnp.zeros(2),
             pupil_diameter_mm=theta[PUPIL],
             blur_px=jnp.exp(theta[BLUR]),
             blur_growth=theta[GROWTH],
@@ -126,7 +128,7 @@ class Evaluator(eqx.Module):
     ) -> Float[Array, "lattice_rows lattice_columns 3"]:
         """Return spline coefficients of the three colours' kernels, for a source whose image is ``disc_px`` wide."""
         model, lattice = self.model(theta), self.lattice
-        transfer = average_transfer(model, frame, lattice, jnp.asarray(model.spectrum), disc_px, rounded=self.shaped)
+        transfer = average_transfer(model, frame, lattice, jnp.asarray(model.spectrum), disc_px, shaped=self.shaped)
         if self.interference:
             transfer += interference_transfer(model, frame, lattice, jnp.asarray(model.spectrum), overlaps, disc_px)
         return spline_coefficients(lattice, transfer)
@@ -138,8 +140,8 @@ class Evaluator(eqx.Module):
         """Return spline coefficients of the kernel at every wavelength node, and its derivatives by factor and colour.
 
         Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the
-        footprint's place (x, y), bars and corners if there may be any, and the blur's covariance, with the ``overlaps``
-        of interference held. The second result has their derivatives by the parameters before the spectra.
+        footprint's place (x, y), bars, corners and slants if there may be any, and the blur's covariance, with the
+        ``overlaps`` of interference held. The second result has their derivatives by the parameters before the spectra.
         """
         model, lattice = self.model(theta), self.lattice
         spectra, variance = jnp.asarray(model.spectrum), blur_variance(model, frame)
@@ -164,7 +166,7 @@ class Evaluator(eqx.Module):
 
             def light(across: int, down: int) -> Float[Array, "rows half"]:
                 alone = (rows[down].T @ columns[across]) * average
-                # Corners are in the average alone.
+                # Corners and slants are in the average alone.
                 return alone + between(x[across], y[down]) if max(across, down) < len(x) else alone
 
             def between(across: Array, down: Array) -> Float[Array, "rows half"]:
@@ -188,9 +190,8 @@ class Evaluator(eqx.Module):
         def factors(head: Float[Array, " head"]) -> Float[Array, "factors 3"]:
             model = self.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
             slits = slits_along(model, frame)
-            shape = jnp.stack([slits.bar_width, slits.bar_place, slits.corner_radius], axis=1).ravel()[
-                : 6 * self.shaped
-            ]
+            shape = jnp.stack([slits.bar_width, slits.bar_place, slits.corner_radius, slits.slant], axis=1).ravel()
+            shape = shape[: shape.size * self.shaped]
             others = head[jnp.array([PITCH, PUPIL])], footprint_place(model, frame)
             common = jnp.concatenate([slits.opened, *others, shape])
             return jnp.concatenate([jnp.tile(common[:, None], (1, 3)), blur_variance(model, frame).T])
@@ -202,28 +203,27 @@ class Evaluator(eqx.Module):
     ) -> Tables:
         """Return tables of slits by node: their values, and ``ways`` derivatives.
 
-        These are by open part, pitch, bar's width, bar's place and corner's radius, in this order. Columns depend on
-        their own openings, bars and corners alone, as do rows.
+        These are by open part, pitch, bar's width, bar's place, corner's radius and slant, in this order. Columns
+        depend on their own openings, bars and corners alone, as do rows.
         """
 
         def at(slits: Slits, pitch_mm: Float[Array, ""]) -> Tables:
             return of_slits(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), slits)
 
-        def changed(way: Float[Array, "5"]) -> tuple[Tables, Tables]:
-            moved = Slits(*(jnp.full(2, way[part]) for part in (0, 2, 3, 4)))
+        def changed(way: Float[Array, "6"]) -> tuple[Tables, Tables]:
+            moved = Slits(*(jnp.full(2, way[part]) for part in (0, 2, 3, 4, 5)))
             return jax.jvp(at, (slits, jnp.asarray(model.pitch_mm)), (moved, way[1]))
 
-        value, derivatives = jax.vmap(changed, out_axes=(None, 0))(jnp.eye(5)[:ways])
+        value, derivatives = jax.vmap(changed, out_axes=(None, 0))(jnp.eye(6)[:ways])
         return jax.tree.map(lambda own, by: jnp.moveaxis(jnp.concatenate([own[None], by]), -1, 0), value, derivatives)
 
     def _parts(self, model: Diffraction, slits: Slits, fx: Float[Array, " half"], fy: Float[Array, " rows"]) -> Tables:
         """Return parts of the average and their derivatives, as fractions of what is open, which changes with them."""
-        ways = 5 if self.shaped else 2
+        ways = 6 if self.shaped else 2
         found = self._tables(lambda m, s: opening_overlaps(m, s, fx, fy, self.shaped), model, slits, ways)
         opened, by = jax.value_and_grad(lambda at: at.open_part(self.shaped))(slits)
-        grown = (
-            jnp.stack([jnp.zeros(2), by.opened, jnp.zeros(2), by.bar_width, by.bar_place, by.corner_radius]) / opened
-        )
+        others = by.bar_width, by.bar_place, by.corner_radius, by.slant
+        grown = jnp.stack([jnp.zeros(2), by.opened, jnp.zeros(2), *others]) / opened
         columns, rows = (part - grown[: ways + 1, axis, None, None] * part[:, :1] for axis, part in enumerate(found))
         return columns, rows / opened
 

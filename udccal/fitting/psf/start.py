@@ -217,6 +217,7 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
         bar_width=np.zeros(2),
         bar_place=np.zeros(2),
         corner_radius=np.float64(0.0),
+        slant=np.zeros(2),
         pupil_diameter_mm=footprint * pitch,
         blur_px=np.float64(rules.blur_px),
         blur_growth=np.zeros(2),
@@ -230,16 +231,17 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
 
 
 def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
-    """Return the parameters as one vector: see ``Evaluator.model``; blur and spectra as logarithms.
+    """Return the parameters as one vector: see ``Evaluator.model``; blur, slants and spectra as logarithms.
 
-    The kernel depends on the square of the blur. The logarithm avoids its two signs and its zero derivative at 0.
+    The kernel depends on the square of the blur, and of a slant. The logarithm avoids its two signs and its zero
+    derivative at 0.
     """
     logs = np.log(np.maximum(np.asarray(model.spectrum), 1e-6))
     red, green, blue = np.asarray(model.blur_colour)
     lens = [np.log(model.blur_px) + green, *np.asarray(model.blur_growth), red - green, blue - green]
     head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm, *lens]
     head += [model.depth_ratio, *np.asarray(model.bar_width), *np.asarray(model.bar_place), model.corner_radius]
-    head += [*np.asarray(model.offset_periods), model.standoff_per_pitch]
+    head += [*np.log(np.maximum(model.slant, 1e-6)), *np.asarray(model.offset_periods), model.standoff_per_pitch]
     return np.concatenate([np.array(head, dtype=float), (logs - logs.mean(axis=1, keepdims=True)).ravel()])
 
 
@@ -279,8 +281,8 @@ def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None 
     pupil_mm = 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value
     of_wire = [panel.column_open.tolerance, panel.row_open.tolerance, panel.depth_mm.tolerance, pupil_mm]
     of_blur = np.repeat([rules.blur_log_sigma, rules.blur_growth, rules.blur_colour], (1, 2, 2))
-    # Without a bar or round corners, their numbers are held.
-    of_shape, of_footprint = [0.0] * 5, [rules.footprint_periods] * 3
+    # Of plain openings, numbers of their shape are held.
+    of_shape, of_footprint = [0.0] * 7, [rules.footprint_periods] * 3
     sigma = [pitch_mm, *(tighter * np.array(of_wire)), *of_blur, rules.depth_ratio, *of_shape, *of_footprint]
     roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]
     for pick in np.eye(theta.size)[HEAD:].reshape(3, -1, theta.size):
