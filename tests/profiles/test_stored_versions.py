@@ -183,7 +183,10 @@ def without(term: str, name: str) -> Callable[[JsonObject], object]:
 CHANGED: Final[dict[str, tuple[Callable[[JsonObject], object], str]]] = {
     "a future version": (lambda d: d.update(version=VERSION + 1), f"newer version {VERSION + 1}"),
     "a version without a number": (lambda d: d.update(version=None), "version number"),
-    "a later version than it is": (lambda d: d.update(version=VERSION), "nonlinearity|captures.steps|depth_ratio|slant"),
+    "a later version than it is": (
+        lambda d: d.update(version=VERSION),
+        "nonlinearity|steps|depth_ratio|slant",
+    ),
     "no term": (lambda d: d["terms"].pop("psf"), "'terms.psf'"),
     "no fit": (lambda d: d["terms"]["wire"].pop("fit"), "'terms.wire.fit'"),
     "no captures": (lambda d: d["terms"]["noise"]["fit"].pop("captures"), "captures"),

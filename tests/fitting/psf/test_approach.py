@@ -27,9 +27,8 @@ def fitted(
     start = start_model(scene.rig, scene.geometry, scene.wire)
     prior = start_prior(scene.rig, start)
     rng, true = np.random.default_rng(5), prior.mean.copy()
-    true[DEPTH_RATIO], true[BAR_WIDTH][axis], true[BAR_PLACE][axis], true[CORNER] = _RATIO, width, place, corner
-    if slant:
-        true[SLANT][axis] = np.log(slant)
+    true[DEPTH_RATIO], true[BAR_WIDTH][axis], true[BAR_PLACE][axis] = _RATIO, width, place
+    true[CORNER], true[SLANT][axis] = np.log(np.maximum([corner, slant], 1e-6))
     shots = shots_of(scene, pictures(scene, true, rng), rng)
     rules = replace(PsfRules(), close_px=scene.half)
     return fit_diffraction(shots, scene.geometry, start, prior, rules), true

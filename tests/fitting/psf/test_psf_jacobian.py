@@ -77,7 +77,7 @@ def slopes_both_ways(
 ) -> tuple[np.ndarray, np.ndarray]:
     problem = problem_of(scene, prior, shots, interference)
     one, theta, evaluator = problem.samples.at(0), prior.mean.copy(), replace(problem.evaluator, shaped=shaped)
-    theta[_SHAPE] = np.array([0.03, 0.05, 0.1, -0.08, 0.12, np.log(0.03), np.log(0.02)]) * shaped
+    theta[_SHAPE] = np.array([0.03, 0.05, 0.1, -0.08, *np.log([0.12, 0.03, 0.02])]) * shaped
     made, chain = (np.asarray(p) for p in evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps))
     by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
     found = np.einsum("yxfc,fcp->pyxc", by_factor, chain)

@@ -58,7 +58,7 @@ class Approach:
         """As an order that BIC compares to others."""
         prior = self.problem.prior
         bars = [f"a bar through openings of {_AXES[axis]}" for axis in np.flatnonzero(prior.mean[BAR_WIDTH])]
-        corners = ["round corners and slants"] * bool(prior.mean[CORNER])
+        corners = ["round corners and slants"] * self.problem.evaluator.shaped
         unknowns = self.problem.unknowns + _OF_SHAPE * len(corners) + _OF_BAR * len(bars)
         criterion = bic(self.end.equations.cost, float(unknowns), self.problem.used)
         return Attempt(f"{', '.join([*corners, *bars]) or 'plain openings'} (BIC)", unknowns, criterion, self)
@@ -137,8 +137,8 @@ def shaped_prior(prior: Prior, rules: PsfRules, bar: tuple[int, float] | None = 
     The openings have the rig's whole tolerances again: the wire has measured them as if they were plain.
     """
     mean, root = prior.mean.copy(), prior.root.copy()
-    shape = [(CORNER, rules.corner, rules.corner)]
-    shape += [(SLANT.start + axis, math.log(rules.slant), rules.slant_log_sigma) for axis in (0, 1)]
+    medians = {CORNER: rules.corner, SLANT.start: rules.slant, SLANT.start + 1: rules.slant}
+    shape = [(number, math.log(median), rules.shape_log_sigma) for number, median in medians.items()]
     if bar is not None:
         axis, place = bar
         shape.append((BAR_WIDTH.start + axis, rules.bar_width, rules.bar_sigma[0]))

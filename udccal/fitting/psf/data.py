@@ -57,8 +57,8 @@ class PsfRules:
         blur_growth, blur_colour: prior sigmas of that logarithm's growth over a focal length, and between colours.
         depth_ratio: prior sigma of the logarithm of the rows' depth over the columns'.
         shaped_from: squared residuals by ``first_model_error`` from which other shapes of openings are looked for.
-        corner: mean and prior sigma of the radius of round corners, in periods.
-        slant, slant_log_sigma: prior of the openings' slants in periods: median, and sigma of the logarithm.
+        corner, slant, shape_log_sigma: priors of the openings' round corners and slants in periods: medians, and the
+            sigma of their logarithms.
         bar_width, bar_sigma: of an opaque bar through the openings: its width at first, and prior sigmas of width and
             place, in periods.
         least_bar: width in periods below which there is no bar.
@@ -106,7 +106,7 @@ class PsfRules:
     shaped_from: float = 1.5
     corner: float = 0.1
     slant: float = 0.02
-    slant_log_sigma: float = 1.0
+    shape_log_sigma: float = 1.0
     bar_width: float = 0.02
     bar_sigma: tuple[float, float] = (0.03, 0.1)
     least_bar: float = 0.003

@@ -21,7 +21,6 @@ from udccal.fitting.psf.approach import Approach, approach, second_approach, sol
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.kernel import (
     BAR_WIDTH,
-    CORNER,
     FOOTPRINT,
     Evaluator,
     Light,
@@ -76,7 +75,7 @@ class DiffractionFit:
     @property
     def shaped(self) -> bool:
         """True where the openings have round corners and slants."""
-        return bool(self.problem.prior.mean[CORNER])
+        return self.problem.evaluator.shaped
 
     @property
     def converged(self) -> bool:

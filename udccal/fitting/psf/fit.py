@@ -61,7 +61,7 @@ _UNITS: Final = dict.fromkeys(("support_rows", "support_columns"), "px") | {
     f"{NOISE_SIGMA}{name}": "mm" for name in ("depth_mm", "pupil_diameter_mm")
 }
 _AXES: Final = ("columns", "rows")
-_SLANTS: Final = range(SLANT.start, SLANT.stop)
+_SHAPES: Final = range(CORNER, SLANT.stop)
 Cov = Float[np.ndarray, "p p"]
 _LENGTHS: Final = np.isin(_NAMES, ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
 
@@ -227,13 +227,11 @@ def _estimates(
     prior, found = fit.problem.prior, _numbers_found(fit)
     names = [_NAMES[number] for number in found]
     values, known, sigma, unit = *(v[found] for v in (fit.theta, prior.mean, prior.sigma)), np.ones(len(found))
-    # The fit's own parameters are logarithms of the blur and of slants.
-    logs = np.isin(found, (BLUR, *_SLANTS))
+    logs = np.isin(found, (BLUR, *_SHAPES))
     values, known = (np.where(logs, np.exp(np.where(logs, part, 0.0)), part) for part in (values, known))
     unit, sigma = np.where(logs, values, unit), np.where(logs, sigma * known, sigma)
     # Kernels do not tell on which side of the opening's middle a bar is.
     values = np.where(np.isin(found, range(BAR_PLACE.start, BAR_PLACE.stop)), np.abs(values), values)
-    values = np.where(np.equal(found, CORNER), np.maximum(values, 0.0), values)
     # The fit holds the pitch: its tolerance scales all lengths.
     sigma[PITCH] = known[PITCH] * tolerance
     by_pitch = np.where(_LENGTHS[found], values, 0.0) * tolerance
@@ -246,7 +244,7 @@ def _estimates(
 def _numbers_found(fit: DiffractionFit) -> list[int]:
     """Return the indices of the numbers that the fit has determined; those of a bar and of shapes if there are such."""
     bar = () if fit.bar_axis is None else (BAR_WIDTH.start + fit.bar_axis, BAR_PLACE.start + fit.bar_axis)
-    return [*range(len(_NUMBERS)), *bar, *([CORNER, *_SLANTS] if fit.shaped else [])]
+    return [*range(len(_NUMBERS)), *bar, *(_SHAPES if fit.shaped else [])]
 
 
 def _posterior(
@@ -291,9 +289,9 @@ def _said_to_be_off(stated: KernelError, magnitude: Magnitude) -> str:
 
 
 def _shape_found(theta: Float[np.ndarray, " p"]) -> str:
-    wider = " and ".join(f"{part:.3f} (those of {of})" for part, of in zip(np.exp(theta[SLANT]), _AXES, strict=True))
-    radius = max(float(theta[CORNER]), 0.0)
-    return f"The openings' corners have a radius of {radius:.3f} of a period; at one end they are wider by {wider}."
+    radius, columns, rows = np.exp(theta[_SHAPES])
+    wider = f"at one end they are wider by {columns:.3f} (columns) and {rows:.3f} (rows) than in their middle"
+    return f"The openings' corners have a radius of {radius:.3f} of a period; {wider}."
 
 
 def _notes(

@@ -55,8 +55,8 @@ WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 # Nodes of a fit's lattice to a pixel.
 PER_PX: Final = 4
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
-# in mm, the logarithm of the blur in px, bars of (columns, rows), round corners, the logarithms of slants of (columns,
-# rows), and the footprint's place on columns and rows with its stand-off, in pitches.
+# in mm, the logarithm of the blur in px, bars of (columns, rows), logarithms of the corners' radius and of slants of
+# (columns, rows), and the footprint's place on columns and rows with its stand-off, in pitches.
 HEAD: Final = 21
 PITCH, PUPIL, BLUR, GROWTH, BLUR_RED, BLUR_BLUE, DEPTH_RATIO = 0, 4, 5, slice(6, 8), 8, 9, 10
 OPENINGS, BAR_WIDTH, BAR_PLACE, CORNER = slice(1, 3), slice(11, 13), slice(13, 15), 15
@@ -101,8 +101,8 @@ class Evaluator(eqx.Module):
             depth_ratio=theta[DEPTH_RATIO],
             bar_width=theta[BAR_WIDTH],
             bar_place=theta[BAR_PLACE],
-            corner_radius=jnp.maximum(theta[CORNER], 0.0),
-            slant=jnp.exp(theta[SLANT]) if self.shaped else jnp.zeros(2),
+            corner_radius=self.shaped * jnp.exp(theta[CORNER]),
+            slant=self.shaped * jnp.exp(theta[SLANT]),
             pupil_diameter_mm=theta[PUPIL],
             blur_px=jnp.exp(theta[BLUR]),
             blur_growth=theta[GROWTH],

@@ -231,17 +231,17 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
 
 
 def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
-    """Return the parameters as one vector: see ``Evaluator.model``; blur, slants and spectra as logarithms.
+    """Return the parameters as one vector: see ``Evaluator.model``; blur, corners, slants and spectra as logarithms.
 
-    The kernel depends on the square of the blur, and of a slant. The logarithm avoids its two signs and its zero
-    derivative at 0.
+    The kernel depends on the square of each. The logarithm avoids its two signs and its zero derivative at 0.
     """
     logs = np.log(np.maximum(np.asarray(model.spectrum), 1e-6))
     red, green, blue = np.asarray(model.blur_colour)
     lens = [np.log(model.blur_px) + green, *np.asarray(model.blur_growth), red - green, blue - green]
     head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm, *lens]
-    head += [model.depth_ratio, *np.asarray(model.bar_width), *np.asarray(model.bar_place), model.corner_radius]
-    head += [*np.log(np.maximum(model.slant, 1e-6)), *np.asarray(model.offset_periods), model.standoff_per_pitch]
+    head += [model.depth_ratio, *np.asarray(model.bar_width), *np.asarray(model.bar_place)]
+    head += np.log(np.maximum([model.corner_radius, *model.slant], 1e-6)).tolist()
+    head += [*np.asarray(model.offset_periods), model.standoff_per_pitch]
     return np.concatenate([np.array(head, dtype=float), (logs - logs.mean(axis=1, keepdims=True)).ravel()])
 
 
