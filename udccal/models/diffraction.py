@@ -232,20 +232,25 @@ def opening_overlaps(
         shaped: whether the openings' corners may be round, and their sides slanted.
     """
     nodes, levels = jnp.asarray(model.wavelengths_nm) * (1e-6 / model.pitch_mm), slits.levels(shaped)
-
     # A node's light is a triangle as wide as its distance to its neighbours.
     lags = [(f[:, None] * nodes, jnp.abs(f)[:, None] * (nodes[1] - nodes[0])) for f in (fx, fy)]
-    lit = slits.opened - slits.bar_width
+    one, other = np.triu_indices(len(levels[0]))
+    number = np.zeros((len(levels[0]),) * 2, dtype=int)
+    number[one, other] = number[other, one] = np.arange(len(one))
 
     def pairs(axis: int) -> Float[Array, "levels levels n nodes"]:
-        lag, spread = lags[axis]
-        opened, bar, place = (part[:, axis, None, None, None] for part in levels)
-        other, other_bar, other_place = (jnp.swapaxes(part, 0, 1) for part in (opened, bar, place))
-        both = window_overlap(opened, other, lag, spread)
-        both += window_overlap(bar, other_bar, lag + other_place - place, spread)
-        both -= window_overlap(opened, other_bar, lag + other_place, spread)
-        both -= window_overlap(other, bar, lag - place, spread)
-        return both
+        (lag, spread), (opened, bar, place) = lags[axis], [part[:, axis, None, None, None] for part in levels]
+        next_opened, next_bar, next_place = (jnp.swapaxes(part, 0, 1) for part in (opened, bar, place))
+        # Without a bar, two levels overlap as they do in the other order.
+        whole = window_overlap(opened[one, 0], opened[other, 0], lag, spread)[number]
+
+        def barred() -> Float[Array, "levels levels n nodes"]:
+            both = whole + window_overlap(bar, next_bar, lag + next_place - place, spread)
+            both -= window_overlap(opened, next_bar, lag + next_place, spread)
+            return both - window_overlap(next_opened, bar, lag - place, spread)
+
+        # A bar takes six times as long as the opening itself.
+        return jax.lax.cond(slits.bar_width[axis] > 0, barred, lambda: whole)
 
     columns, rows = pairs(0), pairs(1)[::-1, ::-1]
     for axis in (0, 1):
@@ -254,6 +259,7 @@ def opening_overlaps(
     if shaped:
         wide, tall = slits.slanted(0, *lags), slits.slanted(1, *lags[::-1])
         columns, rows = jnp.concatenate([columns, wide[0], tall[1]]), jnp.concatenate([rows, wide[1], tall[0]])
+    lit = slits.opened - slits.bar_width
     return columns / lit[0], rows / lit[1]
 
 

@@ -1,4 +1,4 @@
-"""``profile.json``, format version 7, which docs/profile.md describes."""
+"""``profile.json``, format version 8, which docs/profile.md describes."""
 
 from __future__ import annotations
 
