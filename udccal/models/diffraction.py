@@ -9,8 +9,8 @@ coefficients of a row of slits times itself moved by the lag. H_gh is that of th
 lag. (X, Y) is the footprint's centre in pitches (Goodman, Introduction to Fourier Optics, sections 3.10, 6.3).
 The term g = h = 0 is the average over X and Y, an incoherent sum of diffraction orders. With round corners it is a sum
 of products: the opening is a pile of slits, which get narrower as a corner is cut in steps, as they do along an opening
-that is wider at one end. The other terms are the
-interference between neighbouring orders, which changes as the footprint slides over the rows (see ``interference``).
+that is wider at one end. The other terms are the interference between neighbouring orders, which changes as the
+footprint slides over the rows (see ``interference``).
 Direction cosines along the panel make this exact at any angle: the geometry adds stretch and conical bending.
 """
 

@@ -13,16 +13,17 @@ from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction
-from udccal.fitting.psf.kernel import HEAD
+from udccal.fitting.psf.kernel import HEAD, SLANT
 from udccal.fitting.psf.start import some_shots, start_model, start_prior
 from udccal.numerics import in_float64
 
 
 def _drawn(scene: Scene, prior: Prior, seed: int, interference: bool = True) -> tuple[Float[np.ndarray, " p"], Shots]:
-    """Parameters drawn from the prior, and what the fit works on."""
+    """Parameters of plain openings drawn from the prior, and what the fit works on."""
     rng = np.random.default_rng(seed)
     cov = np.linalg.inv(prior.precision)
-    true = prior.mean + np.linalg.cholesky(cov) @ rng.standard_normal(len(cov))
+    drawn = np.insert(rng.standard_normal(len(cov) - 2), SLANT.start, [0.0, 0.0])
+    true = prior.mean + np.linalg.cholesky(cov) @ drawn
     return true, shots_of(scene, pictures(scene, true, rng, interference), rng)
 
 
