@@ -185,7 +185,7 @@ CHANGED: Final[dict[str, tuple[Callable[[JsonObject], object], str]]] = {
     "a version without a number": (lambda d: d.update(version=None), "version number"),
     "a later version than it is": (
         lambda d: d.update(version=VERSION),
-        "nonlinearity|steps|depth_ratio|slant",
+        "nonlinearity|captures.steps|depth_ratio|slant",
     ),
     "no term": (lambda d: d["terms"].pop("psf"), "'terms.psf'"),
     "no fit": (lambda d: d["terms"]["wire"].pop("fit"), "'terms.wire.fit'"),

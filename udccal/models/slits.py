@@ -17,7 +17,7 @@ _STEPS = (0.0, 0.056, 0.179, 0.335, 0.545, 0.803)
 _SLANTED = (-0.75, -0.25, 0.25, 0.75)
 # Of its length, round corners take so many radii at both ends together; what is left slants.
 _ENDS = 1.5
-# A row of slits in lags of periods, and the half of the triangles that they are averaged over.
+# Lags in periods, and half the base of the triangle that each is averaged over.
 Lags = tuple[Float[Array, "_ nodes"], Float[Array, "_ 1"]]
 
 
@@ -54,7 +54,7 @@ class Slits(eqx.Module):
     def slanted(self, axis: int, across: Lags, along: Lags) -> tuple[Array, Array]:
         """Return what a slant adds to the overlap of openings with themselves moved.
 
-        Slits of a slanted opening overlap those next to them by their widths, and lie a quarter of the length apart.
+        It is cut in slits a quarter of its length apart. Pairs equally far apart share their overlap along the length.
 
         Args:
             axis: of the slant, 0 where columns are wider at one end.

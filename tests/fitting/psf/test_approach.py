@@ -14,6 +14,7 @@ from udccal.fitting.psf.fit import _estimates
 from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, CORNER, DEPTH_RATIO, SLANT
 from udccal.fitting.psf.start import start_model, start_prior
 from udccal.numerics import in_float64
+from udccal.result import Estimate
 
 _RATIO = 0.25
 
@@ -34,6 +35,10 @@ def fitted(
     return fit_diffraction(shots, scene.geometry, start, prior, rules), true
 
 
+def numbers_of(fit: DiffractionFit) -> dict[str, Estimate]:
+    return {one.name: one for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize(("axis", "width", "place"), [(1, 0.03, 0.08), (1, 0.02, 0.005), (0, 0.025, 0.3)])
 def test_a_bar_is_found_with_its_width_and_place(axis: int, width: float, place: float) -> None:
@@ -48,7 +53,7 @@ def test_a_bar_is_found_with_its_width_and_place(axis: int, width: float, place:
         found, wanted = abs(fit.theta[part][axis]), true[part][axis]
         assert abs(found - wanted) < 4.5 * sigma[part][axis]
     assert sigma[BAR_WIDTH][axis] < 0.1 * width
-    numbers = {one.name: one for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
+    numbers = numbers_of(fit)
     of = ("column", "row")[axis]
     assert numbers[f"{of}_bar_width"].value == fit.theta[BAR_WIDTH][axis]
     assert numbers[f"{of}_bar_place"].value == abs(fit.theta[BAR_PLACE][axis])
@@ -68,7 +73,7 @@ def test_round_corners_are_found_with_their_radius(corner: float) -> None:
     assert fit.shape is not None
     # A bar was not looked for: openings with round corners fit.
     assert [one.name for one in fit.shape.tried] == _SHAPES_TRIED
-    numbers = {one.name: one for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
+    numbers = numbers_of(fit)
     radius = numbers["corner_radius"]
     assert abs(radius.value - corner) < 4.5 * radius.sigma
     assert radius.sigma < 0.1 * corner
@@ -84,7 +89,7 @@ def test_slants_are_found(axis: int) -> None:
     assert fit.bar_axis is None
     assert fit.shape is not None
     assert [one.name for one in fit.shape.tried] == _SHAPES_TRIED
-    numbers = {one.name: one for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
+    numbers = numbers_of(fit)
     slant, other = (numbers[f"{of}_slant"] for of in (("column", "row") if axis == 0 else ("row", "column")))
     assert abs(slant.value - 0.08) < 4.5 * slant.sigma
     assert slant.sigma < 0.008
@@ -98,7 +103,7 @@ def test_plain_openings_have_neither_bar_nor_corners() -> None:
     assert fit.converged
     assert fit.bar_axis is None
     assert fit.shape is not None
-    names = {one.name for one in _estimates(fit, fit.cov(), 0.01, 0.01, 0.0)[0]}
-    assert not {name for name in names if "bar" in name or "corner" in name}
+    names = numbers_of(fit)
+    assert not {name for name in names if "bar" in name or "corner" in name or "slant" in name}
     # Neither was looked for: plain openings fit.
     assert [one.name for one in fit.shape.tried] == ["plain openings (BIC)"]

@@ -19,6 +19,7 @@ from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRul
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.kernel import (
+    AXES,
     BAR_PLACE,
     BAR_WIDTH,
     CORNER,
@@ -33,7 +34,6 @@ from udccal.fitting.psf.kernel import (
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
 from udccal.numerics import in_two_threads
 
-_AXES: Final = ("columns", "rows")
 # Parameters that a bar has, and that corners and slants have.
 _OF_BAR: Final = 2
 _OF_SHAPE: Final = 3
@@ -57,7 +57,7 @@ class Approach:
     def attempt(self) -> Attempt[Approach]:
         """As an order that BIC compares to others."""
         prior = self.problem.prior
-        bars = [f"a bar through openings of {_AXES[axis]}" for axis in np.flatnonzero(prior.mean[BAR_WIDTH])]
+        bars = [f"a bar through openings of {AXES[axis]}" for axis in np.flatnonzero(prior.mean[BAR_WIDTH])]
         corners = ["round corners and slants"] * self.problem.evaluator.shaped
         unknowns = self.problem.unknowns + _OF_SHAPE * len(corners) + _OF_BAR * len(bars)
         criterion = bic(self.end.equations.cost, float(unknowns), self.problem.used)
@@ -126,7 +126,7 @@ def _with_bar(problem: DiffractionProblem, own: Own, rules: PsfRules) -> Approac
         begun = replace(few, prior=prior)
         end = minimise(begun, begun.at(prior.mean, own[spread]), solver_rules(enough, rules.bar_steps))
         tried.append((end.equations.cost, prior, end.place.theta))
-        LOG.debug("psf: a bar from %.2f of openings of %s, cost %.6g", part, _AXES[axis], end.equations.cost)
+        LOG.debug("psf: a bar from %.2f of openings of %s, cost %.6g", part, AXES[axis], end.equations.cost)
     _, prior, theta = min(tried, key=lambda one: one[0])
     return _descended(replace(problem, prior=prior), theta, own, rules)
 

@@ -33,7 +33,7 @@ from udccal.fitting.psf.held_out import (
     with_support,
 )
 from udccal.fitting.psf.image import Magnitude
-from udccal.fitting.psf.kernel import BAR_PLACE, BAR_WIDTH, BLUR, CORNER, PITCH, SLANT
+from udccal.fitting.psf.kernel import AXES, BAR_PLACE, BAR_WIDTH, BLUR, CORNER, PITCH, SLANT
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.start import as_numpy, pitch_tolerance, some_shots, start_model, start_prior
@@ -60,7 +60,6 @@ NOISE_SIGMA: Final = "noise_sigma_"
 _UNITS: Final = dict.fromkeys(("support_rows", "support_columns"), "px") | {
     f"{NOISE_SIGMA}{name}": "mm" for name in ("depth_mm", "pupil_diameter_mm")
 }
-_AXES: Final = ("columns", "rows")
 _SHAPES: Final = range(CORNER, SLANT.stop)
 Cov = Float[np.ndarray, "p p"]
 _LENGTHS: Final = np.isin(_NAMES, ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
@@ -227,8 +226,9 @@ def _estimates(
     prior, found = fit.problem.prior, _numbers_found(fit)
     names = [_NAMES[number] for number in found]
     values, known, sigma, unit = *(v[found] for v in (fit.theta, prior.mean, prior.sigma)), np.ones(len(found))
+    # The fit's own parameters are logarithms of the blur and of shapes.
     logs = np.isin(found, (BLUR, *_SHAPES))
-    values, known = (np.where(logs, np.exp(np.where(logs, part, 0.0)), part) for part in (values, known))
+    values, known = (np.exp(part, where=logs, out=part.copy()) for part in (values, known))
     unit, sigma = np.where(logs, values, unit), np.where(logs, sigma * known, sigma)
     # Kernels do not tell on which side of the opening's middle a bar is.
     values = np.where(np.isin(found, range(BAR_PLACE.start, BAR_PLACE.stop)), np.abs(values), values)
@@ -307,7 +307,7 @@ def _notes(
         notes = ["cov leaves out spectra and field coefficients of the residual."]
         notes += ["chi2_dof is of the fit of diffraction and allows for the model error of its residuals."]
         if fit.bar_axis is not None:
-            of, wide = _AXES[fit.bar_axis], fit.theta[BAR_WIDTH][fit.bar_axis]
+            of, wide = AXES[fit.bar_axis], fit.theta[BAR_WIDTH][fit.bar_axis]
             notes += [f"A bar {wide:.3f} of a period wide crosses the openings of {of}, such as a wire of the panel."]
         if fit.shaped:
             notes += [_shape_found(fit.theta)]

@@ -62,6 +62,8 @@ PITCH, PUPIL, BLUR, GROWTH, BLUR_RED, BLUR_BLUE, DEPTH_RATIO = 0, 4, 5, slice(6,
 OPENINGS, BAR_WIDTH, BAR_PLACE, CORNER = slice(1, 3), slice(11, 13), slice(13, 15), 15
 SLANT, FOOTPRINT = slice(16, 18), slice(18, 21)
 OWN: Final = 6
+# What pairs of (columns, rows) are of.
+AXES: Final = ("columns", "rows")
 _PER_SAMPLE = ("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps")
 # Parameters of diffraction; own parameters and light of the shots, of one position or of all.
 Theta = Float[np.ndarray, " p"]
