@@ -37,24 +37,35 @@ from udccal.tiers import Tier
 
 def test_the_first_picture_is_exposed_as_a_still_one() -> None:
     linear = np.random.default_rng(1).gamma(2.0, 1e4, (40, 64, 3)).astype(np.float32) - 100
-    assert AutoExposure(linear, 1.0).tone == Tone(display_exposure(linear[::8, ::8]))
+    assert AutoExposure(linear, 1.0, np.inf).tone == Tone(display_exposure(linear[::8, ::8]))
 
 
 def test_exposure_follows_the_light_slowly() -> None:
     linear = np.full((64, 64, 3), 1e4, np.float32)
-    follower = AutoExposure(linear, 1.0)
+    follower = AutoExposure(linear, 1.0, np.inf)
     first = int(follower.tone.rgb8(linear).max())
     jump = follower.tone.rgb8(linear / 4)
     assert jump.max() < 0.6 * first
     for _ in range(80):
-        follower.follow(follower.tone.rgb8(linear / 4))
+        follower.follow(follower.tone.rgb8(linear / 4), np.inf)
     assert int(follower.tone.rgb8(linear / 4).max()) == pytest.approx(first, abs=1)
     linear /= 4
     linear[:16] *= 8  # some of it far too bright
     for _ in range(80):
-        assert follower.follow(follower.tone.rgb8(linear))
+        assert follower.follow(follower.tone.rgb8(linear), np.inf)
     assert int(follower.tone.rgb8(linear).max()) == pytest.approx(first, abs=1)
-    assert not follower.follow(follower.tone.rgb8(linear * 100))
+    assert not follower.follow(follower.tone.rgb8(linear * 100), np.inf)
+
+
+def test_light_that_clips_stays_white_and_is_followed() -> None:
+    linear = np.full((64, 64, 3), 1e4, np.float32)
+    follower = AutoExposure(linear, 1.0, 1e4)
+    for _ in range(80):
+        assert follower.tone.rgb8(linear).min() == 255
+        assert follower.follow(follower.tone.rgb8(linear), 1e4)
+    for _ in range(80):
+        follower.follow(follower.tone.rgb8(linear), np.inf)
+    assert int(follower.tone.rgb8(linear).max()) == pytest.approx(0.9 * 255, abs=1)
 
 
 @pytest.fixture

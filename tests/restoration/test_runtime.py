@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -77,6 +78,29 @@ def test_a_tier_that_does_more_is_more_accurate(
     assert fast > preview + 2.0
     assert balanced > fast + 0.3
     assert accurate > balanced
+
+
+@pytest.mark.parametrize("tier", list(Tier))
+def test_samples_that_clip_are_white_at_the_light_that_says_so(
+    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray, tier: Tier
+) -> None:
+    """In spite of the wire, and of the panel's light that is taken off."""
+    restorer, lit = restorers[tier], toy_scene.copy()
+    light = np.full((96, 128), 300.0 / EXPOSURE_S, np.float32)
+    restorer = replace(restorer, mask=PanelMask(light, cfa_named(restorer.rig.camera.cfa)))
+    lit[30:66, 40:88] = 20_000.0
+    frame = exposed(restorer, toy_grid, lit)
+    clips = restorer.clipping_light(EXPOSURE_S)
+    inside = restorer.rectification.apply((lit == 20_000.0).astype(np.float32))[..., 1] > 0.999
+    inside = cv2.erode(inside.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    assert inside.sum() > 300
+    tenth, half = np.percentile(restorer.restore(frame, EXPOSURE_S)[inside], [10, 50])
+    assert tenth > 0.95 * clips
+    assert half > clips
+    darker = replace(restorer, wire=None, mask=None)
+    assert 1.01 * clips < darker.clipping_light(EXPOSURE_S) < 1.3 * clips
+    hot = replace(restorer, noise=eqx.tree_at(lambda noise: noise.dark_current_e_per_s, restorer.noise, 2e6))
+    assert hot.clipping_light(EXPOSURE_S) == np.inf
 
 
 def test_a_display_shows_what_restore_returns(

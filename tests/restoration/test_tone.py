@@ -28,6 +28,13 @@ def test_the_97th_percentile_is_shown_at_0_9() -> None:
     assert np.percentile(shown, 97) == pytest.approx(0.9, abs=1e-3)
 
 
+def test_light_that_clips_is_white_however_much_there_is_of_it() -> None:
+    lit = np.where(np.arange(40)[:, None, None] < 4, np.float32(6000.0), PICTURE)
+    exposures = np.array([display_exposure(lit), display_exposure(lit, clips=6000.0)])
+    np.testing.assert_allclose(encode_srgb(6000 * exposures), [0.9, 1.0], atol=1e-3)
+    assert display_exposure(PICTURE, clips=8000.0) == display_exposure(PICTURE)
+
+
 def test_gains_work_on_linear_light() -> None:
     even = np.full((2, 2, 3), 0.1, np.float32)
     shown = Tone(1.0, (1.0, 2.0, 0.5)).apply(even)

@@ -23,15 +23,21 @@ class AutoExposure:
     Args:
         linear: a first picture in e-/s.
         least: light in e-/s that counts as bright where all is darker.
+        clips: light in e-/s from which on all is white.
     """
 
-    def __init__(self, linear: Float32[np.ndarray, "rows columns 3"], least: float) -> None:
-        self.tone = Tone(display_exposure(linear[::_STEP, ::_STEP], least))
+    def __init__(self, linear: Float32[np.ndarray, "rows columns 3"], least: float, clips: float) -> None:
+        self.tone = Tone(display_exposure(linear[::_STEP, ::_STEP], least, clips))
 
-    def follow(self, shown: UInt8[np.ndarray, "rows columns 3"]) -> bool:
+    def follow(self, shown: UInt8[np.ndarray, "rows columns 3"], clips: float) -> bool:
         """Move towards the exposure at which ``shown`` would be as bright as a still picture.
 
-        A black picture says nothing. A white one says only that the exposure is far too long.
+        A black picture says nothing. A white one says only that the exposure is far too long, unless it is the shortest
+        at which light that clips is white.
+
+        Args:
+            shown: the picture at this exposure.
+            clips: light in e-/s from which on all is white.
 
         Returns:
             whether it can be followed: after a white picture, the next one has to begin anew.
@@ -40,8 +46,8 @@ class AutoExposure:
         level = float(np.percentile(codes, PERCENTILE))
         if level > 0:
             factor = 0.5 if level == _WHITE else float(_linear(LEVEL * _WHITE) / _linear(level))
-            self.tone = Tone(self.tone.exposure * factor**_PART, self.tone.gains)
-        return bool(np.median(codes) < _WHITE)
+            self.tone = Tone(max(self.tone.exposure * factor**_PART, 1 / clips), self.tone.gains)
+        return bool(np.median(codes) < _WHITE) or self.tone.exposure <= 1 / clips
 
 
 def _linear(code: float) -> Float[np.ndarray, ""]:

@@ -116,13 +116,14 @@ class Restoring:
         exposure_s: float,
         shown: PanelPicture | None,
     ) -> UInt8[np.ndarray, "rows columns 3"]:
+        restorer = _restorer_of(shows)
+        clips = restorer.clipping_light(exposure_s)
         if self._exposure is None:
-            restorer = _restorer_of(shows)
             noise_e = variance_floor_e2(restorer.noise, exposure_s) ** 0.5
             linear = restorer.restore(mosaic, exposure_s, shown)
-            self._exposure = AutoExposure(linear, _LEAST_SIGMAS * noise_e / exposure_s)
+            self._exposure = AutoExposure(linear, _LEAST_SIGMAS * noise_e / exposure_s, clips)
         picture = shows.display(mosaic, exposure_s, self._exposure.tone, shown)
-        if not self._exposure.follow(picture):
+        if not self._exposure.follow(picture, clips):
             self._exposure = None
         return picture
 

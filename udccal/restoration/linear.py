@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float32, UInt16
@@ -54,6 +56,12 @@ def least_saturated_DN(noise: Noise) -> float:
     """Return the value from which on a sample counts as saturated."""
     top, black = scalar(noise.saturation_DN), scalar(noise.black_DN)
     return top - _SATURATION_MARGIN * (top - black)
+
+
+def least_saturated_e(noise: Noise, exposure_s: float) -> float:
+    """Return the signal in e- from which on a sample counts as saturated."""
+    least = np.array([[math.ceil(least_saturated_DN(noise))]], dtype=np.uint16)
+    return float(to_electrons(least, noise, exposure_s)[0, 0])
 
 
 def variance_e2(

@@ -7,6 +7,7 @@ Units: a restored picture is linear light in e-/s of each camera colour, on the 
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -30,7 +31,7 @@ from udccal.restoration.dark_places import plausible
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.linear import saturated, to_electrons, variance_e2
+from udccal.restoration.linear import least_saturated_e, saturated, to_electrons, variance_e2
 from udccal.restoration.panel_mask import PanelMask, mask_mosaic
 from udccal.restoration.plan import PlanOptions, checked_options, kernel_grid
 from udccal.restoration.prepared import kept
@@ -309,6 +310,27 @@ class Restorer:
         check_frame(mosaic, exposure_s, self.rig)
         sensor_e = demosaic(to_electrons(mosaic, self.noise, exposure_s), self.rig.camera.cfa)
         return self.rectification.apply(sensor_e) / np.float32(exposure_s)
+
+    def clipping_light(self, exposure_s: float) -> float:
+        """Return light in e-/s that a restored picture has wherever samples clip: a display shows it white.
+
+        Args:
+            exposure_s: exposure time of the frame in s.
+
+        Raises:
+            RestorationError: when it is no time.
+        """
+        check_exposure(exposure_s)
+        wire, panel = self._brightest
+        light = least_saturated_e(self.noise, exposure_s) / (exposure_s * wire)
+        # A panel that nearly fills the range by itself would leave nothing, and dark current may leave nothing at all.
+        return max(light - panel, light / 2) if light > 0 else math.inf
+
+    @functools.cached_property
+    def _brightest(self) -> tuple[float, float]:
+        """The most that the wire passes, and the most light of a white panel in e-/s."""
+        wire = 1.0 if self.wire is None else float(self.wire.max())
+        return wire, 0.0 if self.mask is None else float(self.mask.white.max())
 
     @functools.cached_property
     def blind(self) -> BlindSamples:

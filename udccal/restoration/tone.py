@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -79,13 +80,16 @@ def encode_srgb(linear: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*sh
     return np.where(clipped <= 0.0031308, np.float32(12.92) * clipped, np.float32(1.055) * root - np.float32(0.055))
 
 
-def display_exposure(linear: Float[np.ndarray, "rows columns 3"], least: float = 1e-12) -> float:
+def display_exposure(
+    linear: Float[np.ndarray, "rows columns 3"], least: float = 1e-12, clips: float = math.inf
+) -> float:
     """Return the factor on ``linear`` light that brings its 97th percentile to the display-encoded value 0.9.
 
-    Where the percentile is below ``least``, it brings this to 0.9.
+    Where the percentile is below ``least``, it brings this to 0.9. Light from ``clips`` on is white, however much there
+    is of it: nothing is known of its detail.
     """
     level = float(np.percentile(linear, PERCENTILE))
-    return ((LEVEL + 0.055) / 1.055) ** 2.4 / max(level, least)
+    return max(((LEVEL + 0.055) / 1.055) ** 2.4 / max(level, least), 1 / clips)
 
 
 def to_rgb8(display: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:

@@ -79,7 +79,8 @@ def restore_files(
                 picture = restorer.restore(mosaic, exposure, scene.shown)
             with storing_in(out):
                 out.mkdir(parents=True, exist_ok=True)
-                write_picture(target, picture, Tone(display_exposure(picture)))
+                clips = restorer.clipping_light(exposure)
+                write_picture(target, picture, Tone(display_exposure(picture, clips=clips)))
             restored.append(RestoredFile(image, target, exposure))
     for item in restored:
         output.say(f"{item.source} -> {item.picture}")
