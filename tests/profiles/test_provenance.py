@@ -9,6 +9,8 @@ from udccal.profiles.units import unit_of
 def test_a_command_says_nothing_about_the_machine() -> None:
     command = portable_command(["/home/me/bin/udccal", "fit", "/data/mine/session", "--profile=/home/me/p", "--json"])
     assert command == "udccal fit session --profile=p --json"
+    assert portable_command(["/home/me/lib/udccal/__main__.py", "fit", "session"]) == "python -m udccal fit session"
+    assert portable_command([]) == ""
 
 
 def test_a_command_with_a_name_that_is_no_text_can_be_stored(monkeypatch: pytest.MonkeyPatch) -> None:

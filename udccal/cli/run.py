@@ -62,7 +62,9 @@ def run(
     ] = None,
     hook_ms: Annotated[
         float | None,
-        typer.Option("--hook-ms", min=0.1, help="A frame whose hook takes longer than this, 10, goes out unaltered."),
+        typer.Option(
+            "--hook-ms", min=0.1, max=60e3, help="A frame whose hook takes longer than this, 10, goes out unaltered."
+        ),
     ] = None,
     frames: Annotated[int | None, typer.Option("--frames", min=1, help="End after so many frames.")] = None,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0.1, help="End after so many seconds.")] = None,

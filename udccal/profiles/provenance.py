@@ -40,8 +40,10 @@ def provenance_now(session_manifest: Path | None, camera: StoredCamera | None) -
 def portable_command(arguments: list[str]) -> str:
     """Return a command line with absolute paths cut to their last name, so that it says nothing about the machine.
 
-    Names that are not text become question marks, as ``as_text`` says.
+    A package that runs as a program, ``python -m package``, is named so. Names that are not text become question marks,
+    as ``as_text`` says.
     """
+    program, *others = arguments or [""]
 
     def portable(argument: str) -> str:
         option, equals, value = argument.partition("=")
@@ -49,7 +51,9 @@ def portable_command(arguments: list[str]) -> str:
             return f"{option}={portable(value)}"
         return PurePath(argument).name if Path(argument).is_absolute() else argument
 
-    return as_text(" ".join(portable(argument) for argument in arguments))
+    path = PurePath(program)
+    named = f"python -m {path.parent.name}" if path.name == "__main__.py" else portable(program)
+    return as_text(" ".join([named, *map(portable, others)]))
 
 
 def as_text(name: str) -> str:
