@@ -40,7 +40,9 @@ def numbers_of(fit: DiffractionFit) -> dict[str, Estimate]:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize(("axis", "width", "place"), [(1, 0.03, 0.08), (1, 0.02, 0.005), (0, 0.025, 0.3)])
+@pytest.mark.parametrize(
+    ("axis", "width", "place"), [(1, 0.03, 0.08), (1, 0.02, 0.005), (0, 0.025, 0.3), (1, 0.034, 0.15)]
+)
 def test_a_bar_is_found_with_its_width_and_place(axis: int, width: float, place: float) -> None:
     fit, true = fitted(axis, width, place)
     assert fit.converged

@@ -14,6 +14,7 @@ from udccal.fitting.psf.data import PsfData, PsfRules, Shots
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.kernel import (
     BAR_WIDTH,
+    CORNER,
     HEAD,
     PITCH,
     PUPIL,
@@ -34,6 +35,8 @@ _HALF = (8, 6)
 _LENS = [1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3]
 _STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, *_LENS, 1e-3, *4 * [1e-5], *6 * [1e-4]])
 _SHAPE = slice(BAR_WIDTH.start, SLANT.stop)
+# Their logarithms are parameters.
+_SHAPES = range(CORNER, SLANT.stop)
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +152,49 @@ def equations_near(scene: Scene, prior: Prior, shots: Shots) -> list[tuple[float
         made = problem.equations_at(problem.at(theta, own, problem.at(other, own)))
         found.append((made.cost, made.right))
     return [(alone.cost, alone.right), *found]
+
+
+@pytest.mark.medium
+def test_derivatives_of_a_place_nearby_follow_the_growth_of_shapes(scene: Scene, prior: Prior, shots: Shots) -> None:
+    for here, near, kept in shaped_slopes_near(scene, prior, shots):
+        assert np.linalg.norm(near - here) < 0.2 * np.linalg.norm(here)
+        assert np.linalg.norm(kept - here) > 0.25 * np.linalg.norm(here)  # that the comparison can fail
+
+
+@in_float64
+def shaped_slopes_near(scene: Scene, prior: Prior, shots: Shots) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Derivatives by each shape: at a place, there by one where that shape is smaller, and of that other place."""
+    problem = problem_of(scene, prior, shots, False)
+    problem = replace(problem, evaluator=replace(problem.evaluator, shaped=True))
+    theta, own = prior.mean.copy(), np.zeros((1, shots.position.tolist().count(0), 6))
+    theta[_SHAPES], own[..., 2:5] = np.log([0.12, 0.03, 0.02]), shots.rate.max()
+    here, found = problem.at(theta, own), []
+    for number in _SHAPES:
+        other = theta.copy()
+        other[number] -= 0.3
+        far = problem.at(other, own)
+        near = problem.at(theta, own, far)
+        found.append((here.by_theta[..., number], near.by_theta[..., number], far.by_theta[..., number]))
+    return found
+
+
+@pytest.mark.parametrize("wanted", [0.2, 0.9, 1.1, 40.0])
+def test_a_step_brings_a_shape_to_the_lowest_cost(wanted: float) -> None:
+    """Of a cost that is quadratic in a power of the shape, which is 1 now."""
+    change, power = 1.0 - wanted, np.array([2.0, 1.0, 1.0])
+    # Half the gradient and half the Hessian of change^2 by the logarithm, as the equations of a step have them.
+    right = -power * change
+    curvature = power**2 + power * np.maximum(-right, 0.0)
+    theta, step = np.zeros(HEAD + 15), np.zeros(HEAD + 15)
+    step[_SHAPES] = right / curvature
+    np.testing.assert_allclose(np.exp(power * stepped(theta, step)[_SHAPES]), wanted, rtol=1e-9)
+
+
+def test_a_step_lets_no_shape_vanish_at_once() -> None:
+    theta, step = np.zeros(HEAD + 15), np.full(HEAD + 15, -5.0)
+    np.testing.assert_allclose(np.exp(stepped(theta, step)[_SHAPES]), [0.1**0.5, 0.1, 0.1])
+    small = np.where(np.arange(HEAD + 15) % 2, 1e-5, -1e-5)
+    np.testing.assert_allclose(stepped(theta, small)[_SHAPES], small[_SHAPES], rtol=1e-4)
 
 
 def test_a_step_makes_spectra_grow_by_what_it_says() -> None:

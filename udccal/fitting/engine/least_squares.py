@@ -115,6 +115,8 @@ class Blocks:
         cross: half the Hessian, shared by own.
         held: shared parameters that make no step, such as those at a bound that the data push against; their
             covariance is that without the bound.
+        stiffer: what a step adds to the diagonal of ``shared``: curvature that Gauss and Newton leave out. It is not in
+            the covariance.
     """
 
     cost: float
@@ -125,6 +127,7 @@ class Blocks:
     own_right: Float[np.ndarray, "k l"]
     cross: Float[np.ndarray, "k p l"]
     held: Bool[np.ndarray, " p"] | None = None
+    stiffer: Float[np.ndarray, " p"] | None = None
 
     @classmethod
     def dense(
@@ -169,6 +172,8 @@ class Blocks:
     def step(self, damping: float) -> Step:
         """To the minimum of the quadratic model, whose diagonal is raised by the part ``damping``."""
         matrix, right, inverse = self._eliminated(damping)
+        if self.stiffer is not None:
+            matrix = matrix + np.diag(self.stiffer)
         if self.held is not None:
             matrix = np.where(self.held[:, None] | self.held, np.diag(np.where(self.held, 1.0, 0.0)), matrix)
             right = np.where(self.held, 0.0, right)

@@ -116,19 +116,25 @@ def _descended(problem: DiffractionProblem, theta: Theta, own: Own, rules: PsfRu
 
 
 def _with_bar(problem: DiffractionProblem, own: Own, rules: PsfRules) -> Approach:
-    """Begin at every place on both axes for a few steps with some positions, and go on from the best with all."""
-    tried = []
+    """Begin at every place on both axes with some positions, and go on from the best with all.
+
+    A descent may begin slowly and end lowest. So after a few steps, several of the best go on to their ends.
+    """
     # Positions spread over the field; the first steps need no more.
     spread = np.unique(np.linspace(0, len(own) - 1, rules.bar_positions).round().astype(int))
     few, enough = replace(problem, samples=problem.samples.at(spread)), 1e-3 * problem.used
+    begun = []
     for axis, part in product(range(2), rules.bar_places):
         prior = shaped_prior(problem.prior, rules, (axis, part * float(problem.prior.mean[OPENINGS][axis])))
-        begun = replace(few, prior=prior)
-        end = minimise(begun, begun.at(prior.mean, own[spread]), solver_rules(enough, rules.bar_steps))
-        tried.append((end.equations.cost, prior, end.place.theta))
+        barred = replace(few, prior=prior)
+        end = minimise(barred, barred.at(prior.mean, own[spread]), solver_rules(enough, rules.bar_steps))
+        begun.append(Approach(barred, end))
         LOG.debug("psf: a bar from %.2f of openings of %s, cost %.6g", part, AXES[axis], end.equations.cost)
-    _, prior, theta = min(tried, key=lambda one: one[0])
-    return _descended(replace(problem, prior=prior), theta, own, rules)
+    begun.sort(key=lambda one: one.end.equations.cost - one.end.gain)
+    rest = solver_rules(enough, rules.iterations)
+    ends = [replace(one, end=minimise(one.problem, one.end.place, rest)) for one in begun[: rules.bar_ends]]
+    best = min(ends, key=lambda one: one.end.equations.cost)
+    return _descended(replace(problem, prior=best.problem.prior), best.end.place.theta, own, rules)
 
 
 def shaped_prior(prior: Prior, rules: PsfRules, bar: tuple[int, float] | None = None) -> Prior:

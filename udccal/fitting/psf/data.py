@@ -63,7 +63,8 @@ class PsfRules:
             place, in periods.
         least_bar: width in periods below which there is no bar.
         bar_places: distances of the bar's middle from the opening's that are tried first, as parts of the opening.
-        bar_positions, bar_steps: field positions of these first tries, and their steps.
+        bar_positions, bar_steps, bar_ends: field positions of these first tries, their steps, and how many of them go
+            on to their ends.
         wire_tolerance: part of the rig's tolerances that is left after the wire's fit.
         pitch_tolerance: part of the pitch's tolerance that the fit may use; see ``start_prior``.
         pitch_well_known: where the pitch's relative tolerance is larger, the nodes cover more wavelengths than
@@ -113,6 +114,7 @@ class PsfRules:
     bar_places: tuple[float, ...] = (0.05, 0.15, 0.3, 0.42)
     bar_positions: int = 3
     bar_steps: int = 4
+    bar_ends: int = 3
     wire_tolerance: float = 0.3
     pitch_tolerance: float = 0.05
     pitch_well_known: float = 0.02

@@ -19,11 +19,13 @@ from udccal.fitting.psf.data import HUBER, Crops, Shots
 from udccal.fitting.psf.image import Sources
 from udccal.fitting.psf.kernel import (
     BLUR,
+    CORNER,
     FOOTPRINT,
     HEAD,
     OWN,
     PITCH,
     PUPIL,
+    SLANT,
     Evaluator,
     Kernel,
     Light,
@@ -40,6 +42,12 @@ from udccal.numerics import in_two_threads
 _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
 # The pitch, both openings and the pupil's diameter: none of them is 0 or less.
 _POSITIVE: Final = np.array([PITCH, 1, 2, PUPIL])
+# Logarithms of the corners' radius and of slants.
+_SHAPES: Final = slice(CORNER, SLANT.stop)
+# Light is nearly linear in these powers of the blur, the corners' radius and slants; 0 for parameters that are no
+# logarithms.
+_POWERS: Final = np.zeros(HEAD)
+_POWERS[BLUR], _POWERS[CORNER], _POWERS[SLANT] = 2.0, 2.0, 1.0
 
 
 @final
@@ -105,7 +113,7 @@ class DiffractionProblem:
         made = in_two_threads(lit, zip(self.samples.each(), own, strict=True))
         light, *derivatives = (np.stack(one) for one in zip(*made, strict=True))
         if near is not None:
-            derivatives = [near.by_theta, near.by_own]
+            derivatives = [_by_grown(near.by_theta, theta[_SHAPES] - near.theta[_SHAPES]), near.by_own]
         return Place(theta, own, light, *derivatives)
 
     def by_position(self, place: Place) -> list[Blocks]:
@@ -124,12 +132,12 @@ class DiffractionProblem:
     def equations_at(self, place: Place) -> Blocks:
         """Return cost and normal equations, with the prior's.
 
-        Light changes with the blur's square, v = exp(2 l). Where data ask for less blur than none, the curvature that
-        Gauss and Newton leave out, (d chi2 / dv) d2v / dl2 = 2 d chi2 / dl, is most of it; steps without it go astray.
+        Light changes with powers, v = exp(k l), of the blur and of shapes. Where data ask for less than none of one,
+        the curvature that Gauss and Newton leave out, k d chi2 / dl, is most of it; steps without it go astray.
         """
         data = Blocks.joined(self.by_position(place))
-        data.shared[BLUR, BLUR] += max(-2.0 * data.right[BLUR], 0.0)
-        return replace(data, held=self.held).with_prior(self.prior, place.theta)
+        stiffer = np.pad(_POWERS * np.maximum(-data.right[:HEAD], 0.0), (0, data.right.size - HEAD))
+        return replace(data, held=self.held, stiffer=stiffer).with_prior(self.prior, place.theta)
 
     def moved(self, place: Place, step: Step) -> Place:
         """Return the place after a step."""
@@ -157,7 +165,7 @@ class DiffractionProblem:
 
 
 def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Return parameters after a step; spectra grow by the step itself, not by its exponential.
+    """Return parameters after a step; spectra and powers of shapes grow by the step itself, not by its exponential.
 
     Lengths and openings stay positive: they at most halve, or double.
     """
@@ -167,7 +175,32 @@ def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Fl
     grown = np.where(grown > 0, np.log1p(np.maximum(grown, 0.0)), grown)
     moved = theta + np.concatenate([step[:HEAD], (mean + grown).ravel()])
     moved[_POSITIVE] = np.clip(moved[_POSITIVE], 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE])
+    moved[_SHAPES] = theta[_SHAPES] + _log_change(step[_SHAPES])
     return moved
+
+
+def _log_change(step: Float[np.ndarray, " shapes"]) -> Float[np.ndarray, " shapes"]:
+    """Return the change of the logarithms of shapes that a step of these means for their powers v = exp(k l).
+
+    Light is nearly linear in v. Gauss and Newton's step s of the logarithm means v (1 + k s): where a shape is too
+    small to be seen, exp(k s) v would be far too much. Steps to less have the curvature that ``equations_at`` adds,
+    without which they would be s / (1 + k s). No v shrinks to less than a tenth.
+    """
+    power = _POWERS[_SHAPES]
+    more, less = power * np.maximum(step, 0.0), power * np.minimum(step, 0.0)
+    part = np.maximum(1.0 + 2.0 * less, 0.0) / (1.0 + np.maximum(less, -0.5))
+    return np.asarray(np.log(np.maximum(part, 0.1) + more) / power)
+
+
+def _by_grown(
+    by_theta: Float[np.ndarray, "positions shots n p"], change: Float[np.ndarray, " shapes"]
+) -> Float[np.ndarray, "positions shots n p"]:
+    """Return derivatives after changes of the shapes' logarithms: those by these grow as their powers do."""
+    if not change.any():
+        return by_theta
+    grown = by_theta.copy()
+    grown[..., _SHAPES] *= np.exp(_POWERS[_SHAPES] * change)
+    return grown
 
 
 def _moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -> Float[np.ndarray, "*k l"]:
