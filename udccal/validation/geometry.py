@@ -66,7 +66,7 @@ def judge_geometry(
     # Boards by hand scatter unequally, by blur and light: as in the fit, each view has a scale of its own.
     points = points.scaled(np.sqrt(np.maximum(ratios, 1.0)))
     found = _prediction(points, place, result)
-    cell, shape = _cells(points, image_size, RULES.pattern_cells)
+    cell, shape = points.cells(image_size)[points.used], 2 * (RULES.pattern_cells,)
     test, size = found.pattern(np.repeat(cell, 2) * 2 + np.tile([0, 1], len(cell)))
     unit = float(np.sqrt(np.mean(points.sigma[points.used] ** 2)))
     off = rms_px(linearised(place, points)[0], points)
@@ -138,12 +138,6 @@ def _prediction(points: Points, place: Bundle, result: FitResult[Geometry], only
     stated = tuple(names[:LENS]) == INTRINSIC_NAMES
     lens = square_root(result.cov[:LENS, :LENS]) if stated else np.zeros((LENS, 0))
     return Prediction(z.ravel(), own, jacobian[:, :, :LENS].reshape(-1, LENS) @ lens)
-
-
-def _cells(points: Points, image_size: tuple[int, int], across: int) -> tuple[Int[np.ndarray, " n"], tuple[int, int]]:
-    """Each used corner's part of the sensor."""
-    part = np.clip(points.image[points.used] / np.array(image_size) * across, 0, across - 1).astype(np.int64)
-    return part[:, 1] * across + part[:, 0], (across, across)
 
 
 def _cell_means(

@@ -188,6 +188,12 @@ class Points:
         """Sums over each view's points in use."""
         return np.bincount(self.view[self.used], values[self.used], len(self.names))
 
+    def cells(self, size: tuple[int, int]) -> Int[np.ndarray, " points"]:
+        """Number of the cell, of ``rules.pattern_cells`` across and down a sensor (columns, rows), of each point."""
+        across = self.rules.pattern_cells
+        x, y = np.clip(self.image / np.array(size) * across, 0, across - 1).astype(np.int64).T
+        return np.asarray(y * across + x)
+
 
 def projected(
     intrinsics: Lens, camera: Float[np.ndarray, "n 3"]

@@ -183,9 +183,7 @@ def residual_pattern(solved: Solved, points: Points, size: tuple[int, int], dof:
     ``group_means_test`` does not serve here: the fit absorbs most of a smooth pattern, so that means of cells scatter
     far less than those of independent residuals. The covariance of the sums accounts for that.
     """
-    (z, jacobian), cells = in_sigma(solved.place, points), points.rules.pattern_cells
-    place = np.clip(points.image / np.array(size) * cells, 0, cells - 1).astype(np.int64)
-    cell = place[:, 1] * cells + place[:, 0]
+    (z, jacobian), cell = in_sigma(solved.place, points), points.cells(size)
     inside = np.equal.outer(np.unique(cell[points.used]), cell) * points.used.astype(np.float64)
     count, sums = np.repeat(inside.sum(axis=1), 2), (inside @ z).ravel()
     slopes = np.zeros((len(inside), 2, LENS + solved.place.poses.size))
