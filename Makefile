@@ -23,7 +23,7 @@ ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto fewer device network budget drift other-days guided rigs live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto full-size fewer device network budget drift other-days guided rigs live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -132,6 +132,11 @@ rigs: $(STAMP)
 # limit. Nothing else should run meanwhile.
 pareto: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.pareto --out $(PARETO_OUT)
+
+# Time and memory of a full-size frame at each tier. Writes a table of docs/restoration.md; non-zero exit where a limit
+# is missed. Nothing else should run meanwhile.
+full-size: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.full_size
 
 # What pictures lose by profiles of fewer captures: nine calibrations of the small rig.
 fewer: $(STAMP)
