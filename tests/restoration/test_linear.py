@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from udccal.models.noise import Noise
-from udccal.restoration.linear import dark_DN, saturated, to_electrons, variance_e2
+from udccal.restoration.linear import dark_DN, least_saturated_e, saturated, to_electrons, variance_e2
 
 
 def test_black_level_gain_and_dark_current(toy_noise: Noise) -> None:
@@ -32,6 +32,14 @@ def test_a_response_that_bends_is_straightened(toy_noise: Noise) -> None:
 
 def test_saturation_is_a_margin_below_the_full_well(toy_noise: Noise) -> None:
     assert saturated(np.array([[3800, 3960, 3969]], np.uint16), toy_noise).tolist() == [[False, True, True]]
+
+
+def test_light_that_saturates_is_that_of_the_first_saturated_code(toy_noise: Noise) -> None:
+    codes = np.arange(3800, 3970, dtype=np.uint16)[None]
+    for nonlinearity in (0.0, 0.03):
+        noise = replace(toy_noise, nonlinearity=nonlinearity, dark_current_e_per_s=20.0)
+        first = to_electrons(codes, noise, 0.5)[saturated(codes, noise)].min()
+        assert first - 1.1 / 0.355 < least_saturated_e(noise, 0.5) <= first + 1e-2
 
 
 def test_variance_of_a_sample(toy_noise: Noise) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float32, UInt16
@@ -60,8 +58,9 @@ def least_saturated_DN(noise: Noise) -> float:
 
 def least_saturated_e(noise: Noise, exposure_s: float) -> float:
     """Return the signal in e- from which on a sample counts as saturated."""
-    least = np.array([[math.ceil(least_saturated_DN(noise))]], dtype=np.uint16)
-    return float(to_electrons(least, noise, exposure_s)[0, 0])
+    black = scalar(noise.black_DN)
+    linear = float(linear_signal(least_saturated_DN(noise) - black, scalar(noise.bend_per_DN)))
+    return (linear - (dark_DN(noise, exposure_s) - black)) / scalar(noise.K_DN_per_e)
 
 
 def variance_e2(

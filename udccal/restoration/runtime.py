@@ -46,6 +46,8 @@ from udccal.tiers import Tier, tier_named
 
 # A preview has no sharp edges to win, and overshoots those that it has by 7 % of their step and not by 12 %.
 _PREVIEW_DETAIL = 0.65
+# In e-/s, or what a wire passes: nothing.
+_NO_LIGHT = 1e-9
 
 Mosaic = Float32[np.ndarray, "rows columns"]
 Picture = Float32[np.ndarray, "rows columns 3"]
@@ -324,12 +326,12 @@ class Restorer:
         wire, panel = self._brightest
         light = least_saturated_e(self.noise, exposure_s) / (exposure_s * wire)
         # A panel that nearly fills the range by itself would leave nothing, and dark current may leave nothing at all.
-        return max(light - panel, light / 2) if light > 0 else math.inf
+        return max(light - panel, light / 2) if light > _NO_LIGHT else math.inf
 
     @functools.cached_property
     def _brightest(self) -> tuple[float, float]:
         """The most that the wire passes, and the most light of a white panel in e-/s."""
-        wire = 1.0 if self.wire is None else float(self.wire.max())
+        wire = 1.0 if self.wire is None else max(float(self.wire.max()), _NO_LIGHT)
         return wire, 0.0 if self.mask is None else float(self.mask.white.max())
 
     @functools.cached_property
