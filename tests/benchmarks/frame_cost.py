@@ -7,22 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
 
 from tests.benchmarks.memory import peak_MiB
+from tests.benchmarks.pareto.restoring import Taken
 from udccal.profiles.profile import Profile
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone, display_exposure
 from udccal.tiers import Tier
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A frame, its exposure, and what the panel showed."""
-
-    mosaic: UInt16[np.ndarray, "rows columns"]
-    exposure_s: float
-    shown: UInt8[np.ndarray, "panel_rows panel_columns 3"]
 
 
 @dataclass(frozen=True)
@@ -34,21 +25,21 @@ class Cost:
     peak_MiB: float
 
 
-def cost_of(profile: Profile, seen: Seen, tier: Tier, keep: Path) -> Cost:
+def cost_of(profile: Profile, taken: Taken, tier: Tier, keep: Path) -> Cost:
     """What a tier costs, in this process.
 
     Args:
         profile: the rig as measured.
-        seen: a frame.
+        taken: a frame.
         tier: how much is done to it.
         keep: folder of prepared arrays.
     """
     start = time.perf_counter()
     restorer = Restorer.from_profile(profile, tier, keep=keep)
-    tone = Tone(display_exposure(restorer.restore(seen.mosaic, seen.exposure_s, seen.shown)))
+    tone = Tone(display_exposure(restorer.restore(taken.frame, taken.exposure_s, taken.panel_picture)))
     start_s, frame_ms = time.perf_counter() - start, []
     for _ in range(5 if tier is Tier.accurate else 25):
         start = time.perf_counter()
-        restorer.display(seen.mosaic, seen.exposure_s, tone, seen.shown)
+        restorer.display(taken.frame, taken.exposure_s, tone, taken.panel_picture)
         frame_ms.append(1e3 * (time.perf_counter() - start))
     return Cost(start_s, float(np.median(frame_ms[-20:])), peak_MiB())

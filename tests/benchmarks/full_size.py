@@ -20,7 +20,8 @@ from typing import Final
 import cv2
 import numpy as np
 
-from tests.benchmarks.frame_cost import Cost, Seen, cost_of
+from tests.benchmarks.frame_cost import Cost, cost_of
+from tests.benchmarks.pareto.restoring import Taken
 from tests.benchmarks.readme_tables import put_table
 from tests.benchmarks.rows import Row, at_most, table
 from udccal.benches.bench import simulated_rig
@@ -66,14 +67,14 @@ def full_size_profile(rig: RigDescription) -> Profile:
     )
 
 
-def seen_by(profile: Profile) -> Seen:
+def taken_by(profile: Profile) -> Taken:
     """A drawn face in front of the simulated rig."""
     rig = profile.rig
     radiance = (face_picture(_SEED, 1024, 768) / 255.0) ** 2.2
     shown = face_picture(_SEED + 1, rig.panel.columns, rig.panel.rows)
     view = Restorer.from_profile(profile, Tier.preview).view
     shot = capture_photograph(simulated_rig(rig, _SEED), radiance, view, shown)
-    return Seen(shot.mosaic, shot.exposure_s, shown)
+    return Taken(shot.mosaic, shot.exposure_s, shown)
 
 
 def rows_of(first: Cost, later: dict[Tier, Cost]) -> list[Row]:
@@ -96,12 +97,12 @@ def rows_of(first: Cost, later: dict[Tier, Cost]) -> list[Row]:
 def main() -> int:
     """Measure each tier; the exit status is 0 when every number keeps its limit."""
     profile = full_size_profile(load_rig(_RIG))
-    seen = seen_by(profile)
+    taken = taken_by(profile)
     with tempfile.TemporaryDirectory() as folder:
 
         def cost(tier: Tier) -> Cost:
             with multiprocessing.get_context("spawn").Pool(1) as pool:
-                return pool.apply(cost_of, (profile, seen, tier, Path(folder)))
+                return pool.apply(cost_of, (profile, taken, tier, Path(folder)))
 
         first = cost(Tier.fast)
         cost(Tier.accurate)  # prepares the rest

@@ -66,7 +66,7 @@ def judge_geometry(
     # Boards by hand scatter unequally, by blur and light: as in the fit, each view has a scale of its own.
     points = points.scaled(np.sqrt(np.maximum(ratios, 1.0)))
     found = _prediction(points, place, result)
-    cell, shape = points.cells(image_size)[points.used], 2 * (RULES.pattern_cells,)
+    cell, shape = points.cells(image_size)[points.used], 2 * (points.rules.pattern_cells,)
     test, size = found.pattern(np.repeat(cell, 2) * 2 + np.tile([0, 1], len(cell)))
     unit = float(np.sqrt(np.mean(points.sigma[points.used] ** 2)))
     off = rms_px(linearised(place, points)[0], points)
