@@ -87,11 +87,17 @@ class TermFits:
     @cached_property
     def wire(self) -> FitResult[Wire]:
         """The wire fit."""
-        noise, geometry = self.noise.term, self.geometry.term
+        noise, geometry = self.noise, self.geometry.term
         rules = WireRules(samples=self._effort.wire_samples)
+
+        def fit() -> FitResult[Wire]:
+            black_sigma_DN = next((one.sigma for one in noise.estimates if one.name == "black_DN"), 0.0)
+            data = read_wire(self._session, noise.term, geometry, rules, black_sigma_DN)
+            return fit_wire(data, rules, self._wire_start)
+
         return self._run(
             "wire",
-            lambda: fit_wire(read_wire(self._session, noise, geometry, rules), rules, self._wire_start),
+            fit,
             lambda: absent_wire(self._session.rig, geometry),
         )
 

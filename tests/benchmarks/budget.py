@@ -231,7 +231,7 @@ def _dB(linear: Rgb, ideal: Rgb, white: float) -> float:
 def true_kernels(blur: FullBlur) -> KernelGrid:
     """The kernels of the simulated blur at its own nodes; the ripple of interference is left out."""
     mean = blur.mean
-    kernels = np.einsum("crij,cryx->yxcij", mean.components, mean.coefficients)
+    kernels = np.einsum("crij,ryx->yxcij", mean.components, mean.coefficients, optimize=True)
     return KernelGrid(mean.grid_x_px, mean.grid_y_px, kernels / kernels.sum(axis=(3, 4), keepdims=True))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.benchmarks.budget import true_kernels
 from tests.benchmarks.full_blur import FullBlur, build_full_blur
 from tests.simulation.toy import toy_truth
 from udccal.simulation.blur import SpaceVariantBlur, build_blur
@@ -35,3 +36,15 @@ def test_points_have_the_simulators_kernels_interference_included() -> None:
     assert full < 4e-3
     # The blur without interference does not pass.
     assert _worst_error(truth, build_blur(truth, 3, 3, *_WINDOW)) > 2 * full
+
+
+@pytest.mark.medium
+def test_the_kernels_of_the_budget_are_the_blurs_own_at_its_nodes() -> None:
+    truth = toy_truth()
+    grid = true_kernels(build_full_blur(truth, 3, 3, *_WINDOW))
+    assert grid.kernels.shape == (3, 3, 3, *_WINDOW)
+    node = np.array([[grid.x_px[1], grid.y_px[2]]])
+    kernel = kernels(truth, node, *_WINDOW)[0]
+    off = grid.kernels[2, 1] - kernel / kernel.sum(axis=(1, 2), keepdims=True)
+    # Interference changes a kernel by a percent, other nodes by more.
+    assert np.sqrt((off**2).sum() / (kernel**2).sum()) < 0.02

@@ -28,6 +28,7 @@ def made_levels(seed: int) -> Levels:
         dof=np.full(mean.shape, samples / 2),
         samples=np.full(mean.shape, samples),
         usable=usable,
+        uneven2=np.zeros(mean.shape),
         light=light,
         dark_DN=np.zeros(10),
         row_variance_DN2=np.zeros(10),
@@ -48,3 +49,22 @@ def test_a_level_that_is_brighter_than_its_exposure_makes_it_unsteady() -> None:
     factor[[3, 6]] = 0.995
     choice = choose_transfer(replace(levels, mean_DN=levels.mean_DN * factor), DARK, 4000.0, NoiseRules())
     assert choice.best.fit.order.unsteady
+
+
+def test_uneven_light_within_bins_does_not_look_like_more_curvature() -> None:
+    """A panel's rows modulate a bin's light; its mean then lacks the mean of squares, not the square of the mean."""
+    made, curvature, K, uneven2 = made_levels(3), 5e-6, 0.36, 0.04
+    light = np.sqrt(uneven2) * np.array([[[-1.5]], [[-0.5]], [[0.5]], [[1.5]]]) / np.sqrt(1.25)
+    z = made.mean_DN * (1 + light)
+    bent = replace(
+        made,
+        mean_DN=np.mean(z - curvature * (z**2 + K * z), axis=0),
+        variance_DN2=np.mean(K * z * (1 - 2 * curvature * z) ** 2, axis=0) + made.variance_DN2 - K * made.mean_DN,
+        uneven2=np.full(made.mean_DN.shape, uneven2),
+    )
+    found = choose_transfer(bent, DARK, 4000.0, NoiseRules()).best.fit
+    assert found.order.curved
+    assert abs(found.values[2] - curvature) < 3 * found.cov[2, 2] ** 0.5
+    # As if each bin's pixels had equal light.
+    even = choose_transfer(replace(bent, uneven2=np.zeros(z.shape[1:])), DARK, 4000.0, NoiseRules()).best.fit
+    assert even.values[2] - curvature > 3 * even.cov[2, 2] ** 0.5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import equinox as eqx
@@ -183,6 +183,23 @@ def test_columns_of_unequal_gain_are_told_and_in_the_maps_sigma(bench: Bench, fi
     error = 100 * np.sqrt(np.mean((sensor_map(uneven.term, ROWS, COLUMNS) - truth / truth.mean()) ** 2))
     stated = uneven.diagnostic("wire_map_rms_sigma")
     assert stated == pytest.approx(error, rel=0.3)
+
+
+@pytest.mark.medium
+def test_the_error_by_the_dark_level_is_stated(bench: Bench) -> None:
+    """The map that a dark level of 1 % of the light makes is off by what is stated of it."""
+    signal, variance = flat_of(bench.truth, 1)
+    off, sites = 10.0, np.array([1400.0, 2000.0, 2000.0, 1200.0])
+    data = WireData(signal + off, variance, bench.geometry, bench.start, 0.005, dark_sigma=off)
+    result = fit_wire(data)
+    error = sensor_map(result.or_raise().term, *signal.shape) / bench.truth - 1
+    by_dark = off * np.mean(1 / sites) * np.std(1 / bench.truth)
+    assert result.diagnostic("map_sigma_by_dark_level") == pytest.approx(100 * by_dark, rel=0.1)
+    assert np.std(error) == pytest.approx(by_dark, rel=0.3)
+    # With a level that is taken for exact, the error is silent.
+    exact = fit_wire(replace(data, dark_sigma=0.0))
+    assert result.diagnostic("wire_map_rms_sigma") > 0.8 * 100 * np.std(error)
+    assert exact.diagnostic("wire_map_rms_sigma") < 0.5 * 100 * np.std(error)
 
 
 @pytest.mark.medium

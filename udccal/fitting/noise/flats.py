@@ -171,8 +171,8 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     above, K, q = mean - dark.black_DN, dark.K_DN_per_e, data.q_DN
     variance = steadied(flats, variance, above)
     # Bins keep 5 sigma of their noise and 2.5 of their shading away from the range's ends.
-    temporal, uneven = 5.0 * np.sqrt(variance), 2.5 * np.sqrt(np.maximum(spread**2 - variance, 0.0))
-    usable = (above > 0) & (above <= up_to_DN) & (mean + temporal + uneven < ceiling_DN) & (mean > temporal)
+    temporal, uneven = 5.0 * np.sqrt(variance), np.sqrt(np.maximum(spread**2 - variance, 0.0))
+    usable = (above > 0) & (above <= up_to_DN) & (mean + temporal + 2.5 * uneven < ceiling_DN) & (mean > temporal)
     # Rounding is white over this spread of samples and this noise.
     usable &= (spread >= 0.7 * q) & (variance >= 0.2 * q**2)
     # The distribution of few counts has steps: rounding is white once noise smears them over a code. With a variance
@@ -188,7 +188,8 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     drawn = np.array([[dark.columns.drawn_DN4(of.frames - 1)] for of in flats]) * usable.sum(axis=1, keepdims=True)
     dof = stacked(flats, "dof")
     dof = dof / (1 + 0.5 * dof * drawn / np.maximum(variance, 1e-9) ** 2)
-    by_bin = above, variance, dof, stacked(flats, "samples"), usable
+    uneven2 = np.where(usable, (uneven / np.where(usable, above, 1.0)) ** 2, 0.0)
+    by_bin = above, variance, dof, stacked(flats, "samples"), usable, uneven2
     return Levels(*by_bin, light, dark.dark_DN_per_s.value * exposure_s, rows + dark.unsteady_DN**2)
 
 

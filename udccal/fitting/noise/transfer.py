@@ -1,6 +1,7 @@
 """Photon transfer and response at once: gain K, read noise V0, curvature by maximum likelihood (EMVA 1288, clause 6).
 
-The sensor turns a linear signal z (DN above black) into y = z - c (z^2 + K z): c is 0 for a linear one. Then
+The sensor turns a linear signal z (DN above black) into y = z - c (z^2 + K z): c is 0 for a linear one. In the mean of
+a bin whose light has the relative variance v, z^2 is (1 + v) times the square of its mean. Then, for one pixel,
 
     temporal variance = (K z + g^2 z^2) (1 - 2 c z)^2 + V0 + q^2/12,     light part of z = A (u + u0),
 
@@ -42,8 +43,9 @@ class Levels:
     """Bright exposures, already reduced: one row per level, one column per bin (CFA site x tile).
 
     ``mean_DN`` is above black, ``variance_DN2`` temporal with ``dof``, ``samples`` are frames times pixels, ``usable``
-    are bins safely inside the range of the sensor, and ``light`` is the relative exposure to light, nan where unknown.
-    ``dark_DN`` is each level's dark signal, and ``row_variance_DN2`` the variance of its mean by row noise and black.
+    are bins safely inside the range of the sensor, ``uneven2`` is the relative variance of the light of a bin's pixels,
+    and ``light`` the relative exposure to light, nan where unknown. ``dark_DN`` is each level's dark signal, and
+    ``row_variance_DN2`` the variance of its mean by row noise and black.
     """
 
     mean_DN: Grid
@@ -51,6 +53,7 @@ class Levels:
     dof: Grid
     samples: Grid
     usable: Bool[np.ndarray, "levels bins"]
+    uneven2: Grid
     light: PerLevel
     dark_DN: PerLevel
     row_variance_DN2: PerLevel
@@ -153,10 +156,13 @@ class TransferProblem:
     def predicted(self, x: Six) -> PerDatum:
         """The data by the model."""
         K, V0, c, gain, offset, noise2 = x
-        levels, dark = self.levels, self.dark
+        levels, dark, mean_square = self.levels, self.dark, 1 + self.levels.uneven2
+        c = c * mean_square
         with np.errstate(divide="ignore", invalid="ignore"):
-            signal = np.nan_to_num(linear_signal(np.where(levels.usable, levels.mean_DN, 0.0), c, K), posinf=0.0)
-            variance = temporal_variance(signal[levels.usable], K, V0, c, dark.rounding_DN2, noise2)
+            signal = np.nan_to_num(
+                linear_signal(np.where(levels.usable, levels.mean_DN, 0.0), c, K / mean_square), posinf=0.0
+            )
+            variance = temporal_variance(signal, K, V0, c, dark.rounding_DN2, noise2 * mean_square)[levels.usable]
             bright = _brightness(signal - levels.dark_DN[:, None], levels.usable) / (gain * (levels.light + offset))
         variance = np.maximum(variance, 1e-9)
         return np.concatenate([variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, (1 - bright)[levels.responding]])

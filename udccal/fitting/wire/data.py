@@ -15,7 +15,7 @@ import cv2
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from scipy.optimize import nnls
 
 from udccal.arguments import check_array, check_number, number_of
@@ -27,7 +27,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, linear_signal
 from udccal.numerics import in_two_threads
 from udccal.result import Outliers
-from udccal.sessions.store import Session
+from udccal.sessions.store import Average, Session
 
 # Tiles of the sensor, down and across, whose residuals are tested as a whole.
 TILES = (6, 8)
@@ -52,6 +52,7 @@ class WireData:
         clip: signal at which single frames begin to clip; pixels are left out where the model expects more.
         clipped: part of the flat's pixels whose average is clipped.
         cfa: pattern of the sensor; each of its sites has a gain.
+        dark_sigma: of the dark level that was subtracted, one error for all pixels, in the unit of ``signal``.
 
     Raises:
         FitError: when the arrays are not pictures of one size, no variance is usable, or a number is impossible.
@@ -65,6 +66,7 @@ class WireData:
     clip: float = np.inf
     clipped: float = 0.0
     cfa: str = "RGGB"
+    dark_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         advice = "Pass the average of one mosaic, and give each pixel its variance."
@@ -74,6 +76,7 @@ class WireData:
             raise FitError("Expected variances of 0 or more, found none. Take them from the frames that were averaged.")
         for name, number in (("PRNU1288", self.PRNU1288), ("part of clipped pixels", self.clipped)):
             check_number(number_of(number), f"a {name}", (0.0, 1.0), "Take it from the noise fit.", FitError)
+        check_number(number_of(self.dark_sigma), "a sigma of the dark level", (0.0, np.inf), advice, FitError)
         if np.isnan(self.clip):
             raise FitError("Expected a signal from which frames clip, found NaN. Leave it out if nothing clips.")
         if self.cfa not in PATTERNS:
@@ -102,34 +105,56 @@ def _usual_mean(values: Float[np.ndarray, " n"]) -> float:
     return float(values[off <= 20 * np.median(off)].mean(dtype=np.float64))
 
 
-def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:
+def read_wire(
+    session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None, black_sigma_DN: float = 0.0
+) -> WireData:
     """Read the steps ``wire/dark`` and ``wire/flat`` of a session, at one exposure, in DN.
 
-    The noise term gives saturation and PRNU, ``rules`` the distance of single frames from saturation.
+    The noise term gives saturation and PRNU, ``rules`` the distance of single frames from saturation. Where dark codes
+    are too coarse, or cut off, the noise term gives the dark level too, whose sigma is ``black_sigma_DN``.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
     rules = rules or WireRules()
-    flat, dark = (session.average(session.step(f"wire/{step}").captures[0]) for step in ("flat", "dark"))
-    saturation, black, bend = (
-        float(np.asarray(one)) for one in (noise.saturation_DN, noise.black_DN, noise.bend_per_DN)
+    captured = (session.step(f"wire/{step}").captures[0] for step in ("flat", "dark"))
+    (flat, _), (dark, dark_s) = ((session.average(one), one.exposure_s) for one in captured)
+    saturation, black, bend, K = (
+        float(np.asarray(one)) for one in (noise.saturation_DN, noise.black_DN, noise.bend_per_DN, noise.K_DN_per_e)
     )
-    lit, unlit = (linear_signal(one.mean - np.float32(black), np.float32(bend)) for one in (flat, dark))
+    by_term = _dark_by_term(dark, noise, black + K * float(np.asarray(noise.dark_current_e_per_s)) * dark_s)
+    dark_mean = dark.mean if by_term is None else by_term
+    lit, unlit = (linear_signal(mean - np.float32(black), np.float32(bend)) for mean in (flat.mean, dark_mean))
     # Where the response bends, it shows less of the noise as well: the slope of linear signals, to first order.
     steep2 = (1 + 2 * np.float32(bend) * lit) ** 2
     headroom = float(linear_signal(saturation - black, bend)) - float(np.mean(unlit))
-    shot = np.sqrt(max(headroom * float(np.asarray(noise.K_DN_per_e)), 0.0))
     return WireData(
         signal=lit - unlit,
         variance=flat.variance * steep2 / flat.frames + dark.variance / dark.frames,
         geometry=geometry,
         start=wire_start(session.rig),
         PRNU1288=float(np.asarray(noise.PRNU1288)),
-        clip=headroom - rules.headroom_sigma * float(shot),
+        clip=headroom - rules.headroom_sigma * max(headroom * K, 0.0) ** 0.5,
         clipped=float(np.mean(flat.mean >= 0.98 * saturation)),
         cfa=session.rig.camera.cfa,
+        dark_sigma=0.0 if by_term is None else black_sigma_DN,
     )
+
+
+def _dark_by_term(dark: Average, noise: Noise, level_DN: float) -> Float32[np.ndarray, "rows columns"] | None:
+    """The dark signal by the noise term's level, where codes are too coarse or cut off for their mean; else None.
+
+    The mean of rounded codes is off by up to half a code where noise does not spread them: by 0.002 codes at a noise
+    of half a code, and 0.05 at 0.3 (Widrow and Kollar, Quantization Noise, 2008). Defects beyond a code stay.
+    """
+    q, seen2 = float(np.asarray(noise.q_DN)), float(np.median(dark.variance))
+    usual, spread = float(np.median(dark.mean)), seen2**0.5
+    # Half a code squared, and the variance of rounding.
+    resolved = seen2 >= (1 / 4 + 1 / 12) * q**2 and level_DN >= 3 * spread
+    # A term of another camera, or of the rig's description, has another black.
+    if resolved or abs(level_DN - usual) > q + spread:
+        return None
+    return np.where(np.abs(dark.mean - usual) > q, dark.mean, np.float32(level_DN))
 
 
 @final

@@ -91,7 +91,9 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
         left_out = float(np.hypot(tied, missing.sigma if missing else 0.0))
     else:
         left_out = unseen(search.harmonics, found.problem.pixels, rules)
-    return _result(joint, jacobian, off, left_out, shape, rules)
+    # A dark level that is off changes dim places by a larger part than bright ones.
+    by_dark = data.dark_sigma * float(np.mean(1 / data.site_means) * np.std(1 / jacobian.value))
+    return _result(joint, jacobian, off, (left_out, by_dark), shape, rules)
 
 
 @in_float64
@@ -216,14 +218,20 @@ def _joint(found: Descent, every: Pixels, search: Search) -> _Joint:
 
 
 def _result(
-    joint: _Joint, jacobian: MapJacobian, found: Misfits, left_out: float, shape: tuple[int, int], rules: WireRules
+    joint: _Joint,
+    jacobian: MapJacobian,
+    found: Misfits,
+    unfitted: tuple[float, float],
+    shape: tuple[int, int],
+    rules: WireRules,
 ) -> FitResult[Wire]:
     """The result of a finished fit, on a sensor of that shape.
 
-    ``left_out`` is the relative part by harmonics that are tied or omitted, or by rows that may be there unseen, RMS
-    over the sensor.
+    ``unfitted`` is the relative part by harmonics that are tied or omitted, or by rows that may be there unseen, and
+    that by the dark level, RMS over the sensor.
     """
-    seen, solution, model = joint.seen, joint.last.solution, float(np.hypot(found.sigma, left_out))
+    (left_out, by_dark), seen, solution = unfitted, joint.seen, joint.last.solution
+    model = float(np.linalg.norm([found.sigma, left_out, by_dark]))
     posterior = jacobian.posterior(joint.parameters, joint.x, joint.cov, model)
     term, outliers = _trimmed(posterior.term), seen.outliers(shape[1])
     drawn = np.flatnonzero(seen.pixels.weight > 0)
@@ -234,6 +242,7 @@ def _result(
         ("wire_map_rms_sigma", 100 * jacobian.sigma(joint.cov, model), "%"),
         ("wire_map_model_sigma", 100 * model, "%"),
         ("harmonics_left_out", 100 * left_out, "%"),
+        ("map_sigma_by_dark_level", 100 * by_dark, "%"),
         ("residual_pattern_p_value", found.pattern.test.p_value, "1"),
         ("residual_lines_p_value", found.lines.test.p_value, "1"),
         ("modulation_peak_to_peak", 100 * np.ptp(values_at(term, seen.pixels.thinned(8 * BLOCK))[0]), "%"),
