@@ -5,7 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Float32
 
 from udccal.models.arrays import Arrayish
 
@@ -49,6 +50,31 @@ def linear_signal(mean_DN, bend_per_DN, K_DN_per_e=0.0):  # type: ignore[no-unty
 def electrons(noise: Noise, signal_DN: Float[Arrayish, "*n"]) -> Float[Array, "*n"]:
     """Return the linear signal in e-: DN above black, without the response's bend, over K."""
     return jnp.asarray(linear_signal(jnp.asarray(signal_DN) - noise.black_DN, noise.bend_per_DN) / noise.K_DN_per_e)
+
+
+def coarse_dark(
+    noise: Noise, mean_DN: Float32[np.ndarray, "*n"], variance_DN2: Float32[np.ndarray, "*n"], exposure_s: float
+) -> Float32[np.ndarray, "*n"] | None:
+    """Return the dark signal in DN by the noise term, where codes are too coarse or cut off for their mean; else None.
+
+    The mean of rounded codes is off by up to half a code where noise does not spread them: by 0.002 codes at a noise
+    of half a code, and 0.05 at 0.3 (Widrow and Kollar, Quantization Noise, 2008). Defects beyond a code keep their own.
+
+    Args:
+        noise: the noise term.
+        mean_DN, variance_DN2: of dark frames, pixel by pixel; the variance is that of one frame.
+        exposure_s: exposure time.
+    """
+    K, black, q, rate = (
+        float(np.asarray(one)) for one in (noise.K_DN_per_e, noise.black_DN, noise.q_DN, noise.dark_current_e_per_s)
+    )
+    level, usual, seen2 = black + K * rate * exposure_s, float(np.median(mean_DN)), float(np.median(variance_DN2))
+    # Half a code squared, and the variance of rounding.
+    resolved = seen2 >= (1 / 4 + 1 / 12) * q**2 and level >= 3 * seen2**0.5
+    # A term of another camera, or of the rig's description, has another black.
+    if resolved or abs(level - usual) > q + seen2**0.5:
+        return None
+    return np.where(np.abs(mean_DN - usual) > q, mean_DN, np.float32(level))
 
 
 # One compilation instead of one per operation.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from jaxtyping import Float
@@ -13,9 +15,9 @@ from udccal.fitting.backscatter.model import PanelCrop, corners_of, directions, 
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise, linear_signal, variance_e
+from udccal.models.noise import Noise, coarse_dark, linear_signal, variance_e
 from udccal.rig import RigDescription
-from udccal.sessions.schema import DarkSubject, PanelSubject
+from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep
 from udccal.sessions.store import Average, Session
 
 
@@ -46,10 +48,18 @@ def read_backscatter(
     if not white or not dark:
         nothing, none = np.zeros((0, 3, 1, 1)), np.zeros(0)
         return BackscatterData(Binned(nothing, nothing, nothing, nothing > 0, none, none), shown, crop, ())
-    captures = (step.captures[0] for step in (white[0], *(step for step, _ in others), dark[0]))
-    shots = binned(((session.average(one), one.exposure_s) for one in captures), noise, shading, bins)
+    captures = (step.captures[0] for step in (white[0], *(step for step, _ in others)))
+    averages = chain(((session.average(one), one.exposure_s) for one in captures), [_dark(session, dark[0], noise)])
+    shots = binned(averages, noise, shading, bins)
     shown = np.concatenate([shown, *(crop.of(session.picture(subject))[None] for _, subject in others)])
     return BackscatterData(shots, shown, crop, tuple(step.id for step, _ in others))
+
+
+def _dark(session: Session, step: StoredStep, noise: Noise) -> tuple[Average, float]:
+    """The dark frame's average and exposure, by the noise term where codes are too coarse to tell the dark level."""
+    average, exposure_s = session.average(step.captures[0]), step.captures[0].exposure_s
+    coarse = coarse_dark(noise, average.mean, average.variance, exposure_s)
+    return average if coarse is None else replace(average, mean=coarse), exposure_s
 
 
 def binned(

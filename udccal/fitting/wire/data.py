@@ -15,7 +15,7 @@ import cv2
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
 
 from udccal.arguments import check_array, check_number, number_of
@@ -24,10 +24,10 @@ from udccal.errors import FitError
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.parameters import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise, linear_signal
+from udccal.models.noise import Noise, coarse_dark, linear_signal
 from udccal.numerics import in_two_threads
 from udccal.result import Outliers
-from udccal.sessions.store import Average, Session
+from udccal.sessions.store import Session
 
 # Tiles of the sensor, down and across, whose residuals are tested as a whole.
 TILES = (6, 8)
@@ -122,8 +122,8 @@ def read_wire(
     saturation, black, bend, K = (
         float(np.asarray(one)) for one in (noise.saturation_DN, noise.black_DN, noise.bend_per_DN, noise.K_DN_per_e)
     )
-    by_term = _dark_by_term(dark, noise, black + K * float(np.asarray(noise.dark_current_e_per_s)) * dark_s)
-    dark_mean = dark.mean if by_term is None else by_term
+    coarse = coarse_dark(noise, dark.mean, dark.variance, dark_s)
+    dark_mean = dark.mean if coarse is None else coarse
     lit, unlit = (linear_signal(mean - np.float32(black), np.float32(bend)) for mean in (flat.mean, dark_mean))
     # Where the response bends, it shows less of the noise as well: the slope of linear signals, to first order.
     steep2 = (1 + 2 * np.float32(bend) * lit) ** 2
@@ -137,24 +137,8 @@ def read_wire(
         clip=headroom - rules.headroom_sigma * max(headroom * K, 0.0) ** 0.5,
         clipped=float(np.mean(flat.mean >= 0.98 * saturation)),
         cfa=session.rig.camera.cfa,
-        dark_sigma=0.0 if by_term is None else black_sigma_DN,
+        dark_sigma=0.0 if coarse is None else black_sigma_DN,
     )
-
-
-def _dark_by_term(dark: Average, noise: Noise, level_DN: float) -> Float32[np.ndarray, "rows columns"] | None:
-    """The dark signal by the noise term's level, where codes are too coarse or cut off for their mean; else None.
-
-    The mean of rounded codes is off by up to half a code where noise does not spread them: by 0.002 codes at a noise
-    of half a code, and 0.05 at 0.3 (Widrow and Kollar, Quantization Noise, 2008). Defects beyond a code stay.
-    """
-    q, seen2 = float(np.asarray(noise.q_DN)), float(np.median(dark.variance))
-    usual, spread = float(np.median(dark.mean)), seen2**0.5
-    # Half a code squared, and the variance of rounding.
-    resolved = seen2 >= (1 / 4 + 1 / 12) * q**2 and level_DN >= 3 * spread
-    # A term of another camera, or of the rig's description, has another black.
-    if resolved or abs(level_DN - usual) > q + spread:
-        return None
-    return np.where(np.abs(dark.mean - usual) > q, dark.mean, np.float32(level_DN))
 
 
 @final
