@@ -2,7 +2,6 @@
 
 import contextlib
 import fcntl
-import mmap
 import sys
 import time
 from collections.abc import Iterator
@@ -14,30 +13,26 @@ import numpy as np
 def frames(name: str) -> Iterator[tuple[int, np.ndarray | None]]:
     """Frame id and RGB picture of each newest frame, until the writer ends; None for a torn one."""
     with Path("/dev/shm", name).open("rb") as file:
-        memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        version, _, width, height, stride, kind, slots, edge = np.frombuffer(memory, np.uint32, 8, 8).tolist()
-        if (memory[:8], version, kind) != (b"UDCCALFR", 1, 1):
+        memory, seen = np.memmap(file, np.uint8, "r"), 0
+        version, _, width, height, stride, kind, slots, edge = memory[8:40].view(np.uint32).tolist()
+        if (bytes(memory[:8]), version, kind) != (b"UDCCALFR", 1, 1):
             sys.exit(f"expected frames of udccal, version 1, 8-bit RGB, in {name}, found something else")
-        words, seen = np.frombuffer(memory, np.uint64), 0
+        words = memory.view(np.uint64)
         while not words[8]:  # the writer has not ended
-            if (newest := int(words[7])) == seen:
-                time.sleep(1e-3)
-                with contextlib.suppress(BlockingIOError):  # the writer locks the memory for as long as it lives
-                    fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-                    if not words[8]:
-                        sys.exit(f"expected the writer of {name} to live, found that it was killed; start it again")
-                continue
-            slot = int(words[6]) + (newest - 1) % slots * int(words[5])
-            last = int(words[(slot + int(words[5]) - edge) // 8])  # first of all
-            rows = np.frombuffer(memory, np.uint8, stride * height, slot + edge).reshape(height, stride)
-            picture = rows[:, : 3 * width].reshape(height, width, 3).copy()
-            frame_id, first = words[slot // 8 + 1], words[slot // 8]  # last of all
-            yield int(frame_id), picture if last == newest == first else None
-            seen = newest
+            time.sleep(1e-3)
+            with contextlib.suppress(BlockingIOError):  # the writer locks the memory for as long as it lives
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                if not words[8]:
+                    sys.exit(f"expected the writer of {name} to live, found that it was killed; start it again")
+            if (newest := int(words[7])) != seen:
+                slot, seen = int(words[6]) + (newest - 1) % slots * int(words[5]), newest
+                last = words[(slot + int(words[5]) - edge) // 8]  # first of all
+                rows = memory[slot + edge :][: stride * height].reshape(height, stride)
+                picture = rows[:, : 3 * width].reshape(height, width, 3).copy()
+                frame_id, first = words[slot // 8 + 1], words[slot // 8]  # last of all
+                yield int(frame_id), picture if last == newest == first else None
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit(f"usage: {sys.argv[0]} NAME")
     for frame_id, picture in frames(sys.argv[1]):
         print(f"frame {frame_id}: {'torn' if picture is None else f'mean {picture.mean():.2f}'}", flush=True)
