@@ -183,6 +183,11 @@ def test_columns_of_unequal_gain_are_told_and_in_the_maps_sigma(bench: Bench, fi
     error = 100 * np.sqrt(np.mean((sensor_map(uneven.term, ROWS, COLUMNS) - truth / truth.mean()) ** 2))
     stated = uneven.diagnostic("wire_map_rms_sigma")
     assert stated == pytest.approx(error, rel=0.3)
+    # What columns share moves the openings, by what their sigmas say.
+    for name in ("column_open", "depth_per_pitch", "standoff_per_pitch"):
+        one, even = uneven.estimate(name), fitted.estimate(name)
+        assert abs(one.value - even.value) < 3 * one.sigma, name
+    assert uneven.estimate("column_open").sigma > 1.5 * fitted.estimate("column_open").sigma
 
 
 @pytest.mark.medium

@@ -21,7 +21,16 @@ from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
-from udccal.fitting.wire.data import BLOCK, Pixels, Weighed, WireData, flat_noise, sample_pixels
+from udccal.fitting.wire.data import (
+    BLOCK,
+    TILES,
+    Pixels,
+    Weighed,
+    WireData,
+    flat_noise,
+    sample_pixels,
+    tile_numbers,
+)
 from udccal.fitting.wire.jacobian import WireProblem, values_at, weighed_at
 from udccal.fitting.wire.map_error import (
     MapJacobian,
@@ -84,7 +93,7 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
     panel = wire if joint.parameters.panel else None
     off = misfits(tested, panel, jacobian.sigma(joint.cov), held_out, joint.variance, rules)
     if off.found:
-        joint = replace(joint, cov=clustered_cov(joint.cov, joint.last.problem.sums(joint.x)[1] / joint.variance))
+        joint = replace(joint, cov=_wider(joint, off.lines.test.found, shape))
     if panel is not None:
         missing = omitted(data.start, wire, joint.seen, rules)
         tied = tied_sigma(joint.strengths, wire, joint.seen, joint.variance)
@@ -94,6 +103,17 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
     # A dark level that is off changes dim places by a larger part than bright ones.
     by_dark = data.dark_sigma * float(np.mean(1 / data.site_means) * np.std(1 / jacobian.value))
     return _result(joint, jacobian, off, (left_out, by_dark), shape, rules)
+
+
+def _wider(joint: _Joint, lines: bool, shape: tuple[int, int]) -> Float[np.ndarray, "n n"]:
+    """The covariance where parts of the sensor differ by more than noise: tiles, and columns and rows where they do."""
+    of_lines = [
+        (lambda pixels: pixels.place % shape[1], shape[1]),
+        (lambda pixels: np.maximum(pixels.place, 0) // shape[1], shape[0]),
+    ]
+    groups = [(lambda pixels: tile_numbers(pixels.scaled), int(np.prod(TILES))), *(of_lines if lines else ())]
+    each = joint.last.problem.scores(joint.x, groups)
+    return joint.cov + np.sum([clustered_cov(joint.cov, one / joint.variance) - joint.cov for one in each], axis=0)
 
 
 @in_float64

@@ -10,7 +10,7 @@ single precision, which is as accurate as its J0.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
@@ -18,10 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy import sparse
 
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, Step
-from udccal.fitting.wire.data import BLOCK, TILES, FlatNoise, Pixels, Weighed, tile_numbers, weighed
+from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, weighed
 from udccal.fitting.wire.parameters import Kind, Parameters, shape_vector
 from udccal.models.arrays import Arrayish
 from udccal.models.bessel import bessel_j0_j1, sine_cosine
@@ -323,29 +324,49 @@ class WireProblem:
 
     def equations_at(self, place: _Numbers) -> Blocks:
         """Cost and normal equations in units of the residual variance."""
-        matrix, by_tile, chi2 = self.sums(place)
+        matrix, right, chi2 = self.sums(place)
         used, variance = self.pixels.used, self.variance(chi2)
         cost = max(used - len(place), 1) * float(np.log(variance))
-        by_data = Blocks.dense(cost, used, matrix / variance, by_tile.sum(axis=0) / variance)
+        by_data = Blocks.dense(cost, used, matrix / variance, right / variance)
         return by_data.with_prior(self.prior, place)
 
     def variance(self, chi2: float) -> float:
         """Variance of the residuals in units of the noise's."""
         return chi2 / max(self.pixels.used - len(self.prior.mean), 1) + LEAST_VARIANCE
 
-    def sums(self, place: _Numbers) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
-        """Information by the pixels' weights, the right side by tile, and chi-squared."""
-        wire, gains, tiles = self.parameters.wire(place), self.parameters.gains(place), np.arange(TILES[0] * TILES[1])
+    def sums(self, place: _Numbers) -> tuple[Float[np.ndarray, "n n"], _Numbers, float]:
+        """Information by the pixels' weights, the right side, and chi-squared."""
 
-        def of(block: Pixels) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
-            whole, base, rows = block_jacobian(self.parameters, wire, block)
-            level, root = base * gains[block.site], np.sqrt(block.weight)
-            errors, rows = (block.value - whole * level) * root, rows * (root * level)
-            by_tile = np.where(tile_numbers(block.scaled) == tiles[:, None], errors, 0.0) @ rows.T
-            return rows @ rows.T, by_tile, float(errors @ errors)
+        def of(block: Pixels) -> tuple[Float[np.ndarray, "n n"], _Numbers, float]:
+            errors, rows = self._weighted(place, block)
+            return rows @ rows.T, rows @ errors, float(errors @ errors)
 
-        matrices, by_tile, chi2 = zip(*in_two_threads(of, self.pixels.blocks()), strict=True)
-        return np.sum(matrices, axis=0), np.sum(by_tile, axis=0), float(np.sum(chi2))
+        matrices, right, chi2 = zip(*in_two_threads(of, self.pixels.blocks()), strict=True)
+        return np.sum(matrices, axis=0), np.sum(right, axis=0), float(np.sum(chi2))
+
+    def scores(
+        self, place: _Numbers, groups: Sequence[tuple[Callable[[Pixels], Int[np.ndarray, " pixels"]], int]]
+    ) -> list[Float[np.ndarray, "groups n"]]:
+        """Parts of the right side by group of pixels; each way to group them numbers a pixel's group, of so many."""
+        ends = np.cumsum([count for _, count in groups])
+
+        def of(block: Pixels) -> Float[np.ndarray, "every n"]:
+            errors, rows = self._weighted(place, block)
+            own = [number(block) + end - count for (number, count), end in zip(groups, ends, strict=True)]
+            at = np.concatenate(own), np.tile(np.arange(len(errors)), len(groups))
+            sums = sparse.csr_array((np.ones(len(at[0])), at), (int(ends[-1]), len(errors)))
+            return np.asarray(sums @ (errors * rows).T)
+
+        return np.split(np.sum(in_two_threads(of, self.pixels.blocks()), axis=0), ends[:-1])
+
+    def _weighted(
+        self, place: _Numbers, block: Pixels
+    ) -> tuple[Float[np.ndarray, " pixels"], Float[np.ndarray, "n pixels"]]:
+        """Errors of a block's pixels and their Jacobian, over sigma."""
+        wire, gains = self.parameters.wire(place), self.parameters.gains(place)
+        whole, base, rows = block_jacobian(self.parameters, wire, block)
+        level, root = base * gains[block.site], np.sqrt(block.weight)
+        return (block.value - whole * level) * root, rows * (root * level)
 
     def moved(self, place: _Numbers, step: Step) -> _Numbers:
         """The place after a step."""
