@@ -48,6 +48,7 @@ def read_portrait() -> np.ndarray:
     return cv2.resize(picture, (96, 64))[..., ::-1].copy()
 
 
+@pytest.mark.medium
 def test_fit_api_prints_the_noise_term() -> None:
     said = run("examples/fit_api.py")
     assert "CONVERGED" in said

@@ -126,6 +126,7 @@ def overlap_at(lag: Pair, opened: Pair, width: Pair, place: Pair, corner: float,
 _LAGS = [(0.0, 0.0), (0.1, 0.05), (0.2, 0.31), (-0.3, 0.8), (1.4, 0.02), (2.9, 2.95)]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("lag", _LAGS)
 @pytest.mark.parametrize(("width", "place"), [(0.0, 0.0), (0.05, 0.1), (0.06, 0.16)])
 def test_openings_with_round_corners_against_a_sum(lag: Pair, width: float, place: float) -> None:
@@ -143,6 +144,7 @@ def test_openings_with_round_corners_against_a_sum(lag: Pair, width: float, plac
     assert abs(square - expected) > 4e-3 or max(expected, 1.0 - expected) > 0.999  # that the comparison can fail
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("lag", _LAGS)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_openings_wider_at_one_end_against_a_sum(lag: Pair, axis: int) -> None:

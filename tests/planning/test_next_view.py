@@ -68,6 +68,7 @@ def led_views(session: Session) -> list[BoardView | None]:
     return views
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("seed", range(2))
 def test_sigmas_of_the_lens_stay_within_10_percent(name: str, seed: int) -> None:

@@ -74,6 +74,7 @@ def test_a_term_that_could_not_be_read_again_leaves_the_old_profile(tmp_path: Pa
     assert (tmp_path / "p" / PROFILE_NAME).read_bytes() == before
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("well", "status"), [(False, 3), (True, 0)])
 def test_a_profile_with_a_warning_has_an_exit_status_of_its_own(tmp_path: Path, well: bool, status: int) -> None:
     program = (

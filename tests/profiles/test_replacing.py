@@ -109,6 +109,7 @@ def test_a_killed_writer_leaves_the_old_profile_or_the_new(
     assert leftovers > 5
 
 
+@pytest.mark.medium
 def test_a_killed_first_write_leaves_none_or_the_whole(tmp_path: Path, toy_profile: Profile) -> None:
     new = dataclasses.replace(toy_profile, parent=NEW)
     place, found = tmp_path / "place", []
@@ -121,6 +122,7 @@ def test_a_killed_first_write_leaves_none_or_the_whole(tmp_path: Path, toy_profi
     assert [item.name for item in place.iterdir()] == ["p"]
 
 
+@pytest.mark.medium
 def test_a_reader_beside_a_writer_finds_one_or_the_other(tmp_path: Path, toy_profile: Profile, way: str) -> None:
     profiles = [dataclasses.replace(toy_profile, parent=parent) for parent in (OLD, NEW)]
     write_profile(tmp_path / "p", profiles[0])

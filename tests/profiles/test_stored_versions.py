@@ -73,6 +73,7 @@ def test_every_number_survives(document: JsonObject, profile: Profile) -> None:
     assert compared >= 50
 
 
+@pytest.mark.medium
 def test_a_migration_changes_no_term(version: int, tmp_path: Path) -> None:
     old = tmp_path / "old.zip"
     old.write_bytes(STORED[version].read_bytes())

@@ -35,6 +35,7 @@ def lit(profile: Profile) -> Backscatter:
     return replace(term, geometry=before_panel)
 
 
+@pytest.mark.medium
 def test_sums_over_pixels_are_the_term(profile: Profile, lit: Backscatter) -> None:
     rig = profile.rig
     picture = np.random.default_rng(5).integers(0, 256, (rig.panel.rows, rig.panel.columns, 3)).astype(np.uint8)

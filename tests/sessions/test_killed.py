@@ -22,6 +22,7 @@ def _killed(folder: Path, *options: str) -> int:
     return int(re.match(r"(\d+) kills", done.stdout).group(1))
 
 
+@pytest.mark.medium
 def test_a_capture_killed_a_few_times_gives_the_same_session(tmp_path: Path) -> None:
     options = ("--kills", "5", "--coarser", "8", "--within-s", "0.15", "--term", "noise", "--term", "wire")
     assert _killed(tmp_path, *options) >= 5

@@ -19,6 +19,7 @@ def frames(fewer: Fewer) -> int:
     return sum(state.cost(term).frames for term in get_args(TermName))
 
 
+@pytest.mark.medium
 def test_each_set_takes_fewer_frames() -> None:
     assert FEWER[0] is ALL
     assert all(frames(fewer) < frames(ALL) for fewer in FEWER[1:])

@@ -27,6 +27,7 @@ def test_an_overshoot_or_a_picture_that_is_not_finite_is_told(broken: float) -> 
     assert [row.ok for row in edge_rows(edges)] == [True, False]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["90 % saturated", "odd size, 95 x 127", "three hot columns, beside them"])
 def test_extremes_that_every_tier_keeps(name: str) -> None:
     extreme = next(each for each in extremes() if each.name == name)

@@ -89,6 +89,7 @@ def test_a_corner_in_glare_is_left_out_by_name() -> None:
     assert np.abs(errors(found)).max() < 4
 
 
+@pytest.mark.medium
 def test_a_view_in_the_wrong_order_is_left_out_whole() -> None:
     board, image, sigma = arrays()
     image[3] = np.random.default_rng(2).permutation(image[3])
@@ -236,6 +237,7 @@ def test_rows_and_columns_exchanged_are_refused() -> None:
         fit_geometry(board, [points[:, ::-1] for points in image], SCENE.size)
 
 
+@pytest.mark.medium
 def test_points_in_the_order_of_another_board_have_no_error_bars() -> None:
     board, image, _ = arrays()
     turned = replace(SCENE.spec, columns=SCENE.spec.rows, rows=SCENE.spec.columns)

@@ -88,6 +88,7 @@ def _codes(frames: Any) -> Any:
     return frames if isinstance(frames, Averaged) else [frame.astype(np.uint16) for frame in frames]
 
 
+@pytest.mark.medium
 def test_a_stack_shorter_than_all_dark_pairs_contradicts_nothing() -> None:
     """It has less dark current, and less noise of it, than any of them."""
     sensor = replace(SENSOR, dark_e_per_s=300.0, read_e=1.5, dark_times_s=(0.5, 1.0, 2.0, 4.0))

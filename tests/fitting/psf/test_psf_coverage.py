@@ -30,6 +30,7 @@ def test_the_error_of_a_kernel_is_found_as_large_as_it_is(true: KernelError) -> 
         assert found.of_peak(np.array([size]))[0] == pytest.approx(true.of_peak(np.array([size]))[0], rel=0.2)
 
 
+@pytest.mark.medium
 def test_noise_is_no_error_of_the_kernel() -> None:
     rng = np.random.default_rng(2)
     found = [estimate_kernel_error(*residuals(KernelError(0.0), rng), SIZES, PICTURES, PsfRules()) for _ in range(20)]
