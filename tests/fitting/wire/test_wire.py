@@ -191,6 +191,20 @@ def test_columns_of_unequal_gain_are_told_and_in_the_maps_sigma(bench: Bench, fi
 
 
 @pytest.mark.medium
+def test_openings_that_are_no_rectangles_are_told(bench: Bench, fitted: FitResult[Wire]) -> None:
+    """The map keeps what the harmonics are; numbers of the openings get a note."""
+    term, told = fitted.term, "stronger or weaker than rectangular openings make them"
+    second = int(np.flatnonzero((np.asarray(term.harmonics) == [0, 2]).all(axis=1))[0])
+    fields = np.asarray(term.fields).copy()
+    fields[second, 0, 0, 0] += 0.6
+    truth = sensor_map(replace(term, fields=fields), ROWS, COLUMNS)
+    result = fit_of(bench, *flat_of(truth / truth.mean(), 1))
+    assert any(told in note for note in result.notes)
+    assert np.std(sensor_map(result.or_raise().term, ROWS, COLUMNS) / truth * truth.mean()) < 6e-4
+    assert not any(told in note for note in fitted.notes)
+
+
+@pytest.mark.medium
 def test_the_error_by_the_dark_level_is_stated(bench: Bench) -> None:
     """The map that a dark level of 1 % of the light makes is off by what is stated of it."""
     signal, variance = flat_of(bench.truth, 1)

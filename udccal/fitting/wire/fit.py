@@ -318,6 +318,13 @@ def _notes(joint: _Joint, found: Misfits, left_out: float, rules: WireRules) -> 
                 "The rows lack the higher harmonics of rectangular openings: row_open and column_open describe the "
                 "strength of the first harmonics, not edges that a microscope would show."
             )
+        elif (free := joint.strengths.free).any():
+            worst = 100 * np.abs(joint.strengths.off[free]).max()
+            yield (
+                f"Harmonics are up to {worst:.2g} % stronger or weaker than rectangular openings make them, which the "
+                "map has: row_open, column_open and depth_per_pitch are those of the rectangles that come closest, and "
+                "an edge may lie beyond their sigmas. The psf tells the openings' shape."
+            )
         for name, sigmas in zip(SHAPE_NAMES, np.abs(off), strict=True):
             if sigmas > rules.doubted_sigma:
                 yield f"{name} is {sigmas * rules.widening:.0f} tolerances away from the rig description; check it."

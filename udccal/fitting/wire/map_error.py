@@ -206,6 +206,11 @@ class Strengths:
     known: Float[np.ndarray, " harmonics"]
     tied: Bool[np.ndarray, " harmonics"]
 
+    @property
+    def free(self) -> Bool[np.ndarray, " harmonics"]:
+        """Harmonics whose strength the pixels show to be another than that of rectangular openings."""
+        return np.asarray((self.known > 0) & ~self.tied)
+
 
 def strengths_of(
     full: Parameters, matrix: _Cov, right: _Vector, keep: Bool[np.ndarray, " n"], values: _Vector
