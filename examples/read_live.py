@@ -34,5 +34,7 @@ def frames(name: str) -> Iterator[tuple[int, np.ndarray | None]]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(f"usage: {sys.argv[0]} NAME")
     for frame_id, picture in frames(sys.argv[1]):
         print(f"frame {frame_id}: {'torn' if picture is None else f'mean {picture.mean():.2f}'}", flush=True)
