@@ -13,8 +13,18 @@ import numpy as np
 from udccal.fitting.hdr.merge import merge_bracket
 from udccal.models.noise import Noise
 
-# K, black, saturation, sigma_d, and the others of docs/maths.md in their order.
-SENSOR = Noise(0.36, 64.0, 4095.0, 4.0, 0.14, 0.0, 1.0, 0.0, 0.0, 0.0)
+SENSOR = Noise(
+    K_DN_per_e=0.36,
+    black_DN=64.0,
+    saturation_DN=4095.0,
+    sigma_d_e=4.0,
+    lambda_read=0.14,
+    sigma_row_DN=0.0,
+    q_DN=1.0,
+    dark_current_e_per_s=0.0,
+    DSNU1288_e=0.0,
+    PRNU1288=0.0,
+)
 EXPOSURES_S = 1e-4 * 2.0 ** np.arange(10)
 
 

@@ -30,12 +30,13 @@ def main() -> None:
 
     result = fit_psf_stamps(stamps)
     print(f"{result.status.name}: {result.status.value}")
-    print("  " + next(candidate.name for candidate in result.candidates if candidate.chosen))
+    for candidate in result.candidates:
+        print(f"  {'>' if candidate.chosen else ' '} {candidate.name:50} {candidate.criterion:.1f}")
     term = result.or_raise().term
 
     corner = np.array([[60.0, 40.0]])
-    peak, sigma = term.predict(corner).max(), term.sigma(corner).max()
-    print(f"In the corner the peak is {peak:.4f} of the light, with a sigma of at most {sigma:.4f};")
+    kernel, sigma = term.predict(corner)[0], term.sigma(corner)[0]
+    print(f"In the corner the peak is {kernel.max():.4f} ± {sigma.ravel()[kernel.argmax()]:.4f} of the light;")
     print(f"the kernel is known to {100 * term.relative_l2(corner)[0, 0]:.2f} % of its norm.")
 
 

@@ -19,18 +19,19 @@ def frames(name: str) -> Iterator[tuple[int, np.ndarray | None]]:
             sys.exit(f"expected frames of udccal, version 1, 8-bit RGB, in {name}, found something else")
         words = memory.view(np.uint64)
         while not words[8]:  # the writer has not ended
-            time.sleep(1e-3)
-            with contextlib.suppress(BlockingIOError):  # the writer locks the memory for as long as it lives
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-                if not words[8]:
-                    sys.exit(f"expected the writer of {name} to live, found that it was killed; start it again")
-            if (newest := int(words[7])) != seen:
-                slot, seen = int(words[6]) + (newest - 1) % slots * int(words[5]), newest
-                last = words[(slot + int(words[5]) - edge) // 8]  # first of all
-                rows = memory[slot + edge :][: stride * height].reshape(height, stride)
-                picture = rows[:, : 3 * width].reshape(height, width, 3).copy()
-                frame_id, first = words[slot // 8 + 1], words[slot // 8]  # last of all
-                yield int(frame_id), picture if last == newest == first else None
+            if (newest := int(words[7])) == seen:
+                time.sleep(1e-3)
+                with contextlib.suppress(BlockingIOError):  # the writer locks the memory for as long as it lives
+                    fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                    if not words[8]:
+                        sys.exit(f"expected the writer of {name} to live, found that it was killed; start it again")
+                continue
+            slot, seen = int(words[6]) + (newest - 1) % slots * int(words[5]), newest
+            last = words[(slot + int(words[5]) - edge) // 8]  # first of all
+            rows = memory[slot + edge :][: stride * height].reshape(height, stride)
+            picture = rows[:, : 3 * width].reshape(height, width, 3).copy()
+            frame_id, first = words[slot // 8 + 1], words[slot // 8]  # last of all
+            yield int(frame_id), picture if last == newest == first else None
 
 
 if __name__ == "__main__":

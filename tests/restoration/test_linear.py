@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from udccal.models.noise import Noise
-from udccal.restoration.linear import dark_DN, least_saturated_e, saturated, to_electrons, variance_e2
+from udccal.models.noise import Noise, dark_DN
+from udccal.restoration.linear import least_saturated_e, saturated, to_electrons, variance_e2
 
 
 def test_black_level_gain_and_dark_current(toy_noise: Noise) -> None:

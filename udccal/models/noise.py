@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32
+from jaxtyping import Array, ArrayLike, Float, Float32
 
 from udccal.models.arrays import Arrayish
 
@@ -52,6 +52,17 @@ def electrons(noise: Noise, signal_DN: Float[Arrayish, "*n"]) -> Float[Array, "*
     return jnp.asarray(linear_signal(jnp.asarray(signal_DN) - noise.black_DN, noise.bend_per_DN) / noise.K_DN_per_e)
 
 
+def scalar(value: ArrayLike) -> float:
+    """Return a term's parameter, a number or an array without dimensions, as a float."""
+    return float(np.asarray(value))
+
+
+def dark_DN(noise: Noise, exposure_s: float) -> float:
+    """Return what a sample reads without light: black level and mean dark signal."""
+    dark_e = scalar(noise.dark_current_e_per_s) * float(exposure_s)  # an exposure may be a number of numpy's
+    return scalar(noise.black_DN) + scalar(noise.K_DN_per_e) * dark_e
+
+
 def coarse_dark(
     noise: Noise, mean_DN: Float32[np.ndarray, "*n"], variance_DN2: Float32[np.ndarray, "*n"], exposure_s: float
 ) -> Float32[np.ndarray, "*n"] | None:
@@ -65,10 +76,8 @@ def coarse_dark(
         mean_DN, variance_DN2: of dark frames, pixel by pixel; the variance is that of one frame.
         exposure_s: exposure time.
     """
-    K, black, q, rate = (
-        float(np.asarray(one)) for one in (noise.K_DN_per_e, noise.black_DN, noise.q_DN, noise.dark_current_e_per_s)
-    )
-    level, usual, seen2 = black + K * rate * exposure_s, float(np.median(mean_DN)), float(np.median(variance_DN2))
+    level, q = dark_DN(noise, exposure_s), scalar(noise.q_DN)
+    usual, seen2 = float(np.median(mean_DN)), float(np.median(variance_DN2))
     # Half a code squared, and the variance of rounding.
     resolved = seen2 >= (1 / 4 + 1 / 12) * q**2 and level >= 3 * seen2**0.5
     # A term of another camera, or of the rig's description, has another black.

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, UInt16
 
 from udccal.cfa import Cfa
-from udccal.models.noise import Noise
-from udccal.restoration.linear import dark_DN, least_saturated_DN, scalar
+from udccal.models.noise import Noise, dark_DN, scalar
+from udccal.restoration.linear import least_saturated_DN
 
 # A sample that passes less than this part of the mean light is blind; so is a row that has less of its neighbours'.
 LEAST_PART: Final = 0.02

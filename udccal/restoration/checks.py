@@ -8,8 +8,8 @@ import numpy as np
 
 from udccal.arguments import check_number, found_instead
 from udccal.errors import RestorationError, UdccalError
+from udccal.models.noise import scalar
 from udccal.profiles.profile import Profile
-from udccal.restoration.linear import scalar
 from udccal.rig import RigDescription
 
 # From a nanosecond to a day.

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8, UInt16
 
 from udccal.cfa import Cfa, cfa_named
-from udccal.models.noise import Noise
-from udccal.restoration.linear import dark_DN, scalar, to_electrons
+from udccal.models.noise import Noise, dark_DN, scalar
+from udccal.restoration.linear import to_electrons
 
 OUTLIER_SIGMA: Final = 8.0
 # A point of light seen through the panel stays below 4 times the range: its kernel is wide.

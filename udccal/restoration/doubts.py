@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt16
 
-from udccal.models.noise import Noise
+from udccal.models.noise import Noise, scalar
 from udccal.profiles.profile import Profile
-from udccal.restoration.linear import scalar, variance_floor_e2
+from udccal.restoration.linear import variance_floor_e2
 from udccal.restoration.panel_mask import BLOCK, PERCENTILE, SIGMAS
 from udccal.rig import Camera
 

@@ -4,23 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float32, UInt16
+from jaxtyping import Bool, Float32, UInt16
 
-from udccal.models.noise import Noise, linear_signal
+from udccal.models.noise import Noise, dark_DN, linear_signal, scalar
 
 # Part of the range above black: where a sample says less than its light was.
 _SATURATION_MARGIN = 0.015
-
-
-def scalar(value: ArrayLike) -> float:
-    """Return a term's parameter, a number or an array without dimensions, as a float."""
-    return float(np.asarray(value))
-
-
-def dark_DN(noise: Noise, exposure_s: float) -> float:
-    """Return what a sample reads without light: black level and mean dark signal."""
-    dark_e = scalar(noise.dark_current_e_per_s) * float(exposure_s)  # an exposure may be a number of numpy's
-    return scalar(noise.black_DN) + scalar(noise.K_DN_per_e) * dark_e
 
 
 def to_electrons(

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float32, UInt8, UInt16
 
 from udccal.cfa import Cfa
-from udccal.models.noise import Noise
+from udccal.models.noise import Noise, scalar
 from udccal.restoration.blind import BlindSamples
 from udccal.restoration.defects import without_defects
-from udccal.restoration.linear import above_dark_DN, scalar
+from udccal.restoration.linear import above_dark_DN
 from udccal.restoration.panel_mask import PanelMask
 from udccal.restoration.rectify import Interpolation, Rectification
 from udccal.restoration.tone import CODES, Tone

@@ -15,7 +15,7 @@ from udccal.fitting.backscatter.model import PanelCrop, corners_of, directions, 
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise, coarse_dark, linear_signal, variance_e
+from udccal.models.noise import Noise, coarse_dark, linear_signal, scalar, variance_e
 from udccal.rig import RigDescription
 from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep
 from udccal.sessions.store import Average, Session
@@ -71,7 +71,7 @@ def binned(
 ) -> Binned:
     """Bin shots, given as averages in DN and exposures in s; means from ``most`` of saturation on are clipped."""
     gain, black_DN, row_DN, saturation_DN, bend_per_DN = (
-        float(np.asarray(getattr(noise, name)))
+        scalar(getattr(noise, name))
         for name in ("K_DN_per_e", "black_DN", "sigma_row_DN", "saturation_DN", "bend_per_DN")
     )
     # Variance of bins if that of a sample over its shading is 1 / shading, or 1: by sample, or by row.
@@ -81,7 +81,7 @@ def binned(
         signal_e = linear_signal(average.mean - black_DN, bend_per_DN) / gain
         clipped = average.mean >= most * saturation_DN
         # Variance in the dark, e-^2: of a row's offset, and of each sample independently.
-        rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
+        rest_e2 = max(scalar(variance_e(noise, np.zeros(()), np.float64(exposure_s))) - row_e2, 0.0)
         expected = np.maximum(signal_e, 0.0) + rest_e2
         shots.append(
             Binned(

@@ -24,7 +24,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.parameters import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise, coarse_dark, linear_signal
+from udccal.models.noise import Noise, coarse_dark, linear_signal, scalar
 from udccal.numerics import in_two_threads
 from udccal.result import Outliers
 from udccal.sessions.store import Session
@@ -120,7 +120,7 @@ def read_wire(
     captured = (session.step(f"wire/{step}").captures[0] for step in ("flat", "dark"))
     (flat, _), (dark, dark_s) = ((session.average(one), one.exposure_s) for one in captured)
     saturation, black, bend, K = (
-        float(np.asarray(one)) for one in (noise.saturation_DN, noise.black_DN, noise.bend_per_DN, noise.K_DN_per_e)
+        scalar(one) for one in (noise.saturation_DN, noise.black_DN, noise.bend_per_DN, noise.K_DN_per_e)
     )
     coarse = coarse_dark(noise, dark.mean, dark.variance, dark_s)
     dark_mean = dark.mean if coarse is None else coarse
@@ -133,7 +133,7 @@ def read_wire(
         variance=flat.variance * steep2 / flat.frames + dark.variance / dark.frames,
         geometry=geometry,
         start=wire_start(session.rig),
-        PRNU1288=float(np.asarray(noise.PRNU1288)),
+        PRNU1288=scalar(noise.PRNU1288),
         clip=headroom - rules.headroom_sigma * max(headroom * K, 0.0) ** 0.5,
         clipped=float(np.mean(flat.mean >= 0.98 * saturation)),
         cfa=session.rig.camera.cfa,

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, UInt8, UInt16
 
 from udccal.arguments import check_kind
 from udccal.errors import RestorationError
+from udccal.models.noise import dark_DN
 from udccal.restoration.backscatter import refuse_excess_of
 from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.clipped import effort_of
@@ -21,7 +22,7 @@ from udccal.restoration.device.light import FrontEnd, PanelTables, plausible
 from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
 from udccal.restoration.device.tile_filter import TileFilter
 from udccal.restoration.kernel_grid import interpolated_kernels
-from udccal.restoration.linear import dark_DN, least_saturated_DN, variance_floor_e2
+from udccal.restoration.linear import least_saturated_DN, variance_floor_e2
 from udccal.restoration.network import SHARPER, Weights, network_weights
 from udccal.restoration.rectify import interpolation_taps
 from udccal.restoration.runtime import Restorer
