@@ -11,9 +11,13 @@ from jaxtyping import Float
 from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.orders import Choice
+from udccal.fitting.psf import diffraction
+from udccal.fitting.psf.approach import Approach, approach
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import DiffractionFit, fit_diffraction
-from udccal.fitting.psf.kernel import HEAD, SLANT
+from udccal.fitting.psf.kernel import FOOTPRINT, HEAD, PUPIL, SLANT
+from udccal.fitting.psf.problem import DiffractionProblem
 from udccal.fitting.psf.start import some_shots, start_model, start_prior
 from udccal.numerics import in_float64
 
@@ -64,6 +68,40 @@ def test_a_footprint_that_starts_too_wide_does_not_end_beside_the_minimum(wider:
     fit, z = _started_off(wider, seed)
     assert fit.converged
     assert fit.model_error == 0.0
+    assert np.abs(z[:HEAD]).max() < 4.5
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("wider", [0.6, 1.4])
+@in_float64
+def test_a_first_descent_beside_the_minimum_is_mended_from_where_it_ended(
+    wider: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A third of a period away with a pupil of another width, a descent stays, with a model error of a hundredth."""
+    scene = small_scene(positions=(3, 2), shifts=2, half=(14, 7))
+    start = start_model(scene.rig, scene.geometry, scene.wire)
+    prior = start_prior(scene.rig, start)
+    true, shots = _drawn(scene, prior, 3)
+
+    def misled(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
+        found = approach(problem, rules).best.fit
+        theta = found.end.place.theta.copy()
+        theta[PUPIL] *= wider
+        theta[FOOTPRINT][1] += 0.3
+        end = replace(found.end, place=replace(found.end.place, theta=theta))
+        attempt = replace(found, end=end).attempt()
+        return Choice(attempt, (attempt,))
+
+    rules = PsfRules(close_px=scene.half)
+    monkeypatch.setattr(diffraction, "approach", misled)
+    fits = []
+    for far in (lambda *_: False, diffraction.far_from_prior):
+        monkeypatch.setattr(diffraction, "far_from_prior", far)
+        fits.append(fit_diffraction(shots, scene.geometry, start, prior, rules))
+    assert fits[0].model_error > 0.005
+    z = (fits[1].theta - true) / np.sqrt(np.diag(fits[1].cov()))
+    assert fits[1].converged
+    assert fits[1].model_error == 0.0
     assert np.abs(z[:HEAD]).max() < 4.5
 
 

@@ -37,6 +37,8 @@ from udccal.numerics import in_two_threads
 # Parameters that a bar has, and that corners and slants have.
 _OF_BAR: Final = 2
 _OF_SHAPE: Final = 3
+# Of the pupil's footprint.
+_WIDTH_AND_PLACE: Final = np.array([PUPIL, *range(FOOTPRINT.start, FOOTPRINT.stop)])
 # Of the prior: a chance that drawn rigs do not have.
 _FAR_SIGMA = 4.0
 
@@ -83,20 +85,30 @@ def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
     return choose(attempts)
 
 
-def second_approach(problem: DiffractionProblem, theta: Theta, rules: PsfRules) -> tuple[Solution[Place, Blocks], ...]:
-    """Begin again where a minimum has left the prior: it may be beside the lowest one.
+def far_from_prior(theta: Theta, prior: Prior) -> bool:
+    """Return whether the footprint's width or place have left the prior: a minimum may be beside the lowest one."""
+    return bool((np.abs(theta - prior.mean) > _FAR_SIGMA * prior.sigma)[_WIDTH_AND_PLACE].any())
 
-    The footprint's place on the rows is periodic in the data, and takes the part of a pupil that is too wide; a model
-    error as large as the residuals there lets the place fit. The second descent has the footprint's place held, which
-    leaves the residuals to the pupil, and no model error. The minima tell which of the two is the lower.
+
+def with_place_held(problem: DiffractionProblem, theta: Theta) -> tuple[DiffractionProblem, Theta]:
+    """Return a problem that holds the footprint's place, and parameters with the prior's footprint.
+
+    The footprint's place on the rows is periodic in the data, and takes the part of a pupil of another width. Held, it
+    leaves the residuals to the pupil.
     """
-    prior = problem.prior
-    far = np.abs(theta - prior.mean) > _FAR_SIGMA * prior.sigma
-    if not far[PUPIL] and not far[FOOTPRINT].any():
-        return ()
-    held = np.zeros(prior.mean.size, dtype=bool)
+    begun, held = theta.copy(), np.zeros(theta.size, dtype=bool)
+    begun[_WIDTH_AND_PLACE] = problem.prior.mean[_WIDTH_AND_PLACE]
     held[FOOTPRINT] = True
-    return (_from_mean(replace(problem, samples=problem.samples.weighed(0.0), held=held), rules).end,)
+    return replace(problem, held=held), begun
+
+
+def approach_without_error(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
+    """Descend from the prior's mean with the footprint's place held, and without a model error.
+
+    Where the wire's footprint is of a wrong width, a model error as large as the residuals there lets the place fit.
+    """
+    held, _ = with_place_held(problem, problem.prior.mean)
+    return _from_mean(replace(held, samples=problem.samples.weighed(0.0)), rules).end
 
 
 def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Approach:

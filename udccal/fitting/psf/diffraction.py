@@ -17,7 +17,14 @@ from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
-from udccal.fitting.psf.approach import Approach, approach, second_approach, solver_rules
+from udccal.fitting.psf.approach import (
+    Approach,
+    approach,
+    approach_without_error,
+    far_from_prior,
+    solver_rules,
+    with_place_held,
+)
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.kernel import (
     BAR_WIDTH,
@@ -178,8 +185,11 @@ def _finish(
         about = replace(problem, samples=gather(moved, geometry, chosen))
         return _refine(about, moved, near.place.theta, own, rules, near.iterations)
 
-    first = refined(begun.end)
-    fits = [first, *(refined(near) for near in second_approach(problem, first.theta, rules))]
+    fits = [refined(begun.end)]
+    if far_from_prior(fits[0].theta, problem.prior):
+        fits.append(_begun_again(fits[0], rules))
+    if far_from_prior(min(fits, key=_unlikely).theta, problem.prior):
+        fits.append(refined(approach_without_error(problem, rules)))
     fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits))
     if not problem.evaluator.interference:
         return fit
@@ -190,6 +200,14 @@ def _finish(
         averaged = DiffractionProblem(gather(fit.shots, geometry, chosen), alone, problem.prior)
         fit = _refine(averaged, fit.shots, fit.theta, fit.solution.place.own, rules, 0)
     return replace(fit, phase=phase)
+
+
+def _begun_again(fit: DiffractionFit, rules: PsfRules) -> DiffractionFit:
+    """Begin at a minimum again, with the prior's footprint, whose place is held at first."""
+    held, theta = with_place_held(fit.problem, fit.theta)
+    near = _refine(held, fit.shots, theta, fit.solution.place.own, rules, 0)
+    freed, own = replace(near.problem, held=None), near.solution.place.own
+    return _refine(freed, fit.shots, near.theta, own, rules, near.iterations)
 
 
 def _unlikely(fit: DiffractionFit) -> float:
