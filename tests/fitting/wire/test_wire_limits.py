@@ -31,9 +31,11 @@ from tests.scenes.wire import (
 )
 from udccal.errors import FitError
 from udccal.fitting.engine.least_squares import LOG
+from udccal.fitting.wire import search
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire
 from udccal.fitting.wire.parameters import WireRules
+from udccal.fitting.wire.search import scan_rows
 from udccal.models.wire import Wire, wire_map
 from udccal.result import FitResult, FitStatus
 
@@ -43,6 +45,24 @@ _PLAIN = 18
 
 def columns_kept(result: FitResult[Wire]) -> int:
     return int(next(d.value for d in result.diagnostics if d.name == "parameters"))
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_scan_that_missed_the_pupil_by_some_periods_leads_to_it(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pupil a period larger, with the origin half a period on, looks nearly the same in the first harmonic."""
+    flat = noisy(drawn_truth(seed, start(), geometry()), 1)
+    pupil = float(flat.truth.footprint_per_pitch)
+
+    def missed(*arguments: Any) -> tuple[list[Wire], float]:
+        found, gain = scan_rows(*arguments)
+        return [one for one in found if abs(float(one.footprint_per_pitch) - pupil) > 1.5], gain
+
+    monkeypatch.setattr(search, "scan_rows", missed)
+    result = fitted(flat, start(), geometry()).or_raise()
+    off = np.array([e.value for e in result.numbers]) - shape_values(flat.truth)
+    off[4:6] -= np.round(off[4:6])
+    assert np.all(np.abs(off) < 4.5 * np.array([e.sigma for e in result.numbers]))
 
 
 @pytest.mark.slow

@@ -158,22 +158,27 @@ class Search:
     ) -> list[Descent]:
         """Descend from the places of a scan: a few steps from each, and to the end from the best.
 
-        A pupil one period larger, with the origin half a period on, has nearly the same first harmonic. Where few
-        pixels cannot distinguish such rivals, all of them come back, best first.
+        Those beside the best count as well, until none of them is better. Where few pixels cannot distinguish rivals,
+        all of them come back, best first.
         """
-        depth, tried, first = np.float64(self.data.start.depth_per_pitch), [], places[0]
-        # For a pupil of several periods, a period of diameter is one zero more, or less, in its transform: the first
-        # harmonic's sign and the origin change.
-        turned = 2 * np.pi * (float(first.offset_periods[1]) + 0.5)
-        sizes = [size for size in (first.footprint_per_pitch - 1, first.footprint_per_pitch + 1) if size > 1]
-        beside = (_placed(first, first.standoff_per_pitch, size, 1, turned) for size in sizes)
-        for place in (first, *beside, *places[1:]):
-            # The rows have given the rest; the columns' first harmonic gives the origin along X.
-            standoff, pupil = place.standoff_per_pitch, place.footprint_per_pitch
-            _, angle = _demodulate(place, gains, sample, 0, np.array([standoff]), np.array([pupil]))
-            placed = replace(_placed(place, standoff, pupil, 0, angle[0, 0]), depth_per_pitch=depth)
-            wire = with_harmonics(placed, harmonics, sample, self.rules.sharpness[0])
-            tried.append(self._descent(wire, gains, sample, SolverRules(least_gain=1e-2, iterations=3)))
+        depth, tried, left = np.float64(self.data.start.depth_per_pitch), [], places
+        while left:
+            for place in left:
+                # The rows have given the rest; the columns' first harmonic gives the origin along X.
+                standoff, pupil = place.standoff_per_pitch, place.footprint_per_pitch
+                _, angle = _demodulate(place, gains, sample, 0, np.array([standoff]), np.array([pupil]))
+                placed = replace(_placed(place, standoff, pupil, 0, angle[0, 0]), depth_per_pitch=depth)
+                wire = with_harmonics(placed, harmonics, sample, self.rules.sharpness[0])
+                tried.append(self._descent(wire, gains, sample, SolverRules(least_gain=1e-2, iterations=3)))
+            sizes = [float(one.wire.footprint_per_pitch) for one in tried]
+            left = []
+            for best in _rivals(tried, self.rules.unfinished):
+                # For a pupil of several periods, a period of diameter is one zero more, or less, in its transform.
+                standoff, size = (float(one) for one in (best.wire.standoff_per_pitch, best.wire.footprint_per_pitch))
+                beside = [other for other in (size - 1, size + 1) if min(abs(other - one) for one in sizes) > 0.5]
+                for pupil in (one for one in beside if one > 1):
+                    _, angle = _demodulate(places[0], gains, sample, 1, np.array([standoff]), np.array([pupil]))
+                    left.append(_placed(places[0], standoff, pupil, 1, angle[0, 0]))
         unfinished = _rivals(tried, self.rules.unfinished)
         rivals = _rivals((self._descent(one.wire, one.gains, sample) for one in unfinished), self.rules.rival)
         best, (count, degree) = rivals[0], self.rules.free
