@@ -185,12 +185,12 @@ def _finish(
         about = replace(problem, samples=gather(moved, geometry, chosen))
         return _refine(about, moved, near.place.theta, own, rules, near.iterations)
 
-    fits = [refined(begun.end)]
-    if far_from_prior(fits[0].theta, problem.prior):
-        fits.append(_begun_again(fits[0], rules))
-    if far_from_prior(min(fits, key=_unlikely).theta, problem.prior):
-        fits.append(refined(approach_without_error(problem, rules)))
-    fit = replace(min(fits, key=_unlikely), iterations=sum(one.iterations for one in fits))
+    fit = refined(begun.end)
+    for begin in (lambda best: _begun_again(best, rules), lambda _: refined(approach_without_error(problem, rules))):
+        if not far_from_prior(fit.theta, problem.prior):
+            break
+        other = begin(fit)
+        fit = replace(min(fit, other, key=_unlikely), iterations=fit.iterations + other.iterations)
     if not problem.evaluator.interference:
         return fit
     phase = phase_evidence(fit)

@@ -161,24 +161,10 @@ class Search:
         Those beside the best count as well, until none of them is better. Where few pixels cannot distinguish rivals,
         all of them come back, best first.
         """
-        depth, tried, left = np.float64(self.data.start.depth_per_pitch), [], places
+        tried, left = [], places
         while left:
-            for place in left:
-                # The rows have given the rest; the columns' first harmonic gives the origin along X.
-                standoff, pupil = place.standoff_per_pitch, place.footprint_per_pitch
-                _, angle = _demodulate(place, gains, sample, 0, np.array([standoff]), np.array([pupil]))
-                placed = replace(_placed(place, standoff, pupil, 0, angle[0, 0]), depth_per_pitch=depth)
-                wire = with_harmonics(placed, harmonics, sample, self.rules.sharpness[0])
-                tried.append(self._descent(wire, gains, sample, SolverRules(least_gain=1e-2, iterations=3)))
-            sizes = [float(one.wire.footprint_per_pitch) for one in tried]
-            left = []
-            for best in _rivals(tried, self.rules.unfinished):
-                # For a pupil of several periods, a period of diameter is one zero more, or less, in its transform.
-                standoff, size = (float(one) for one in (best.wire.standoff_per_pitch, best.wire.footprint_per_pitch))
-                beside = [other for other in (size - 1, size + 1) if min(abs(other - one) for one in sizes) > 0.5]
-                for pupil in (one for one in beside if one > 1):
-                    _, angle = _demodulate(places[0], gains, sample, 1, np.array([standoff]), np.array([pupil]))
-                    left.append(_placed(places[0], standoff, pupil, 1, angle[0, 0]))
+            tried += [self._begun(place, gains, harmonics, sample) for place in left]
+            left = self._beside(tried, places[0], gains, sample)
         unfinished = _rivals(tried, self.rules.unfinished)
         rivals = _rivals((self._descent(one.wire, one.gains, sample) for one in unfinished), self.rules.rival)
         best, (count, degree) = rivals[0], self.rules.free
@@ -188,6 +174,32 @@ class Search:
         other = self._descent(replace(best.wire, amplitudes=room), best.gains, sample)
         # Chance, or noise somewhat larger than given, must not add that many parameters.
         return [other] if other.variance < 0.95 * variance else rivals
+
+    def _begun(
+        self, place: Wire, gains: _Gains, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels
+    ) -> Descent:
+        """A few steps from a place; the rows have given it, but for the origin along X."""
+        placed = _demodulated(
+            place, gains, sample, 0, float(place.standoff_per_pitch), float(place.footprint_per_pitch)
+        )
+        placed = replace(placed, depth_per_pitch=np.float64(self.data.start.depth_per_pitch))
+        wire = with_harmonics(placed, harmonics, sample, self.rules.sharpness[0])
+        return self._descent(wire, gains, sample, SolverRules(least_gain=1e-2, iterations=3))
+
+    def _beside(self, tried: list[Descent], bare: Wire, gains: _Gains, sample: Pixels) -> list[Wire]:
+        """Places a period of the pupil's diameter beside the best, where none was tried; ``bare`` has no modulation.
+
+        For a pupil of several periods, that is one zero more, or less, in its transform.
+        """
+        sizes, made = [float(one.wire.footprint_per_pitch) for one in tried], []
+        for best in _rivals(tried, self.rules.unfinished):
+            standoff, size = (float(one) for one in (best.wire.standoff_per_pitch, best.wire.footprint_per_pitch))
+            for pupil in (size - 1, size + 1):
+                if pupil > 1 and min(abs(pupil - one) for one in sizes) > 0.5:
+                    made.append(_demodulated(bare, gains, sample, 1, standoff, pupil))
+                    # Of rivals two periods apart, the place between them counts once.
+                    sizes.append(pupil)
+        return made
 
     def _descent(
         self,
@@ -307,6 +319,12 @@ def _demodulate(
     phases = (2 * np.pi * standoff * slope for standoff in standoffs)
     sums = np.stack([sizes @ np.stack([errors * np.cos(p), -errors * np.sin(p)], axis=1) for p in phases])
     return 2 * np.sum(sums**2, axis=-1) / power / variance, np.arctan2(sums[..., 1], sums[..., 0])
+
+
+def _demodulated(wire: Wire, gains: _Gains, pixels: Pixels, axis: int, standoff: float, pupil: float) -> Wire:
+    """The wire with this stand-off and pupil, and with the origin that an axis' first harmonic gives."""
+    _, angle = _demodulate(wire, gains, pixels, axis, np.array([standoff]), np.array([pupil]))
+    return _placed(wire, standoff, pupil, axis, angle[0, 0])
 
 
 def _placed(wire: Wire, standoff: float, pupil: float, axis: int, angle: float) -> Wire:
