@@ -12,7 +12,13 @@ from udccal.fitting.psf.kernel import HEAD, PITCH, PUPIL, Evaluator
 from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import LocalFrame, average_transfer, local_frame
 from udccal.models.geometry import Geometry
-from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
+from udccal.models.interference import (
+    footprint_place,
+    interference_transfer,
+    node_overlaps,
+    overlap_tables,
+    strengths,
+)
 from udccal.models.lattice import sample, spline_coefficients
 from udccal.models.psf import lattice_points
 
@@ -58,7 +64,8 @@ def light_and_slopes(
         model = evaluator.model(values)
         transfer = average_transfer(model, frame, grid, light, disc_px, shaped=evaluator.shaped)
         if own is not None:
-            transfer = transfer + interference_transfer(model, frame, grid, light, own, disc_px)
+            strength = strengths(model, footprint_place(model, frame))
+            transfer = transfer + interference_transfer(model, frame, grid, light, own, strength, disc_px)
         return sample(grid, spline_coefficients(grid, transfer), jnp.asarray(points)) * jnp.asarray(density)[:, None]
 
     def along(way: Float[Array, " p"]) -> Float[Array, "n 3"]:

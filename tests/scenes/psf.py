@@ -17,7 +17,13 @@ from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice
 from udccal.fitting.psf.start import cut_crop
 from udccal.models.diffraction import Diffraction, average_transfer, is_shaped, local_frame
 from udccal.models.geometry import Geometry
-from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
+from udccal.models.interference import (
+    footprint_place,
+    interference_transfer,
+    node_overlaps,
+    overlap_tables,
+    strengths,
+)
 from udccal.models.lattice import Lattice, sample, spline_coefficients
 from udccal.models.noise import Noise
 from udccal.models.psf import lattice_points
@@ -122,7 +128,8 @@ def _light(
     spectra = jnp.asarray(model.spectrum)
     overlaps = node_overlaps(model, frame, grid, overlap_tables(model, frame))
     transfer = average_transfer(model, frame, grid, spectra, DISC_PX, shaped=shaped)
-    transfer = transfer + interference_transfer(model, frame, grid, spectra, overlaps, DISC_PX)
+    strength = strengths(model, footprint_place(model, frame))
+    transfer = transfer + interference_transfer(model, frame, grid, spectra, overlaps, strength, DISC_PX)
     points, density = lattice_points(geometry, frame, place, offsets)
     return sample(grid, spline_coefficients(grid, transfer), points) * density[:, None]
 

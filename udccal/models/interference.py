@@ -31,7 +31,7 @@ TERMS = ((0.0, 1.0), (0.0, 2.0), (1.0, 0.0), (2.0, 0.0), (1.0, 1.0), (1.0, -1.0)
 COLUMN_OF, ROW_OF = np.abs(np.array(TERMS, dtype=np.int32)).T
 HIGHEST_ORDER = int(max(COLUMN_OF.max(), ROW_OF.max()))
 _QUADRATURE = 32
-_TABLE = 128
+_TABLE = 256
 
 
 def interference_transfer(
@@ -40,6 +40,7 @@ def interference_transfer(
     lattice: Lattice,
     spectra: Float[Array, "3 nodes"],
     overlaps: Float[Arrayish, "nodes terms rows half"],
+    strength: Float[Arrayish, " terms"],
     disc_px: Float[Arrayish, ""] = 0.0,
 ) -> Float[Array, "3 rows half"]:
     """Return the transfer functions of the interference, to be added to ``average_transfer``.
@@ -50,11 +51,12 @@ def interference_transfer(
         lattice: lattice in panel directions around the source.
         spectra: light of each colour at the model's wavelength nodes.
         overlaps: from ``node_overlaps``; they hardly change during a fit.
+        strength: from ``strengths``.
         disc_px: diameter of a round source on the sensor; 0 for a point.
     """
     fx, fy = lattice_frequencies(frame, lattice)
     columns, rows = slits_of(model, slits_along(model, frame), fx, fy, HIGHEST_ORDER)
-    strength = strengths(model, footprint_place(model, frame))
+    strength = jnp.asarray(strength)
 
     def add(
         total: Float[Array, "3 rows half"], node: tuple[Array, Array, Array, Array]

@@ -26,15 +26,22 @@ from udccal.models.diffraction import (
 )
 from udccal.models.fields import polynomial_basis
 from udccal.models.geometry import Geometry, area_of_pixels, panel_directions
-from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
+from udccal.models.interference import (
+    footprint_place,
+    interference_transfer,
+    node_overlaps,
+    overlap_tables,
+    strengths,
+)
 from udccal.models.lattice import Joined, Lattice, lattice_for, low_pass, sample, spline_coefficients
 
 # A kernel is a cross: detail finer than this band (cycles per pixel) along an axis matters only near the other axis.
-_BAND = (0.8, 1.3)
-_COARSE, _MARGIN = 3, 1.25
+# A cubic spline follows it to 0.3 cycles per node, and to 0.4 with errors of up to a quarter beside the peak.
+_BAND = (0.5, 1.2)
+_COARSE, _MARGIN = 4, 1.25
 _FINE_PX, _FINE_BLEND_PX = 28, (10.0, 14.0)
 # Interference between orders is computed on one lattice over this many (rows, columns), and left out beyond them.
-_INTERFERENCE_PX, _INTERFERENCE_PER_PX = (144, 72), 4
+_INTERFERENCE_PX, _INTERFERENCE_PER_PX = (96, 48), 6
 # Smaller kernels are cut from one of this size: below it little time is saved, and tiny transforms compile slowly.
 _LEAST_PX = 32
 
@@ -122,7 +129,8 @@ def diffraction_kernel(
     close_y, close_x = (min(size, most) * _MARGIN for size, most in zip(size_px, _INTERFERENCE_PX, strict=True))
     grid = lattice_for(close_y, close_x, _INTERFERENCE_PER_PX, _INTERFERENCE_PER_PX)
     overlaps = node_overlaps(model, frame, grid, overlap_tables(model, frame))
-    interference = interference_transfer(model, frame, grid, spectra, overlaps)
+    strength = strengths(model, footprint_place(model, frame))
+    interference = interference_transfer(model, frame, grid, spectra, overlaps, strength)
     values = values + sample(grid, spline_coefficients(grid, interference), points)
     return (values * density[:, None]).T.reshape(-1, rows, columns)
 

@@ -16,6 +16,7 @@ from udccal.fitting.psf.kernel import (
     BAR_WIDTH,
     CORNER,
     HEAD,
+    PER_PX,
     PITCH,
     PUPIL,
     SLANT,
@@ -26,6 +27,7 @@ from udccal.fitting.psf.kernel import (
 )
 from udccal.fitting.psf.problem import DiffractionProblem, stepped
 from udccal.fitting.psf.start import start_model, start_prior, wavelengths_nm
+from udccal.models.lattice import Lattice
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
@@ -84,10 +86,11 @@ def slopes_both_ways(
     made, chain = (np.asarray(p) for p in evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps))
     by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
     found = np.einsum("yxfc,fcp->pyxc", by_factor, chain)
-    wanted = []
+    wanted, same = [], replace(evaluator, lattice=evaluator.slopes_lattice)
+    overlaps = same.overlaps(prior.mean, one.frame)
     for step in np.eye(HEAD, theta.size) * _STEPS[:, None]:
         more, less = (
-            np.asarray(evaluator.kernel(theta + sign * step, one.frame, one.disc_px, one.overlaps)) for sign in (1, -1)
+            np.asarray(same.kernel(theta + sign * step, one.frame, one.disc_px, overlaps)) for sign in (1, -1)
         )
         wanted.append((more - less) / (2 * step.sum()))
     return found, np.stack(wanted)
@@ -98,6 +101,28 @@ def problem_of(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> 
     evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(_HALF), interference)
     made = gather(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool)).at(slice(1))
     return DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
+
+
+@pytest.mark.medium
+def test_light_on_the_fits_lattice_is_that_of_a_finer_one(scene: Scene, prior: Prior, shots: Shots) -> None:
+    kept, coarse = light_errors(scene, prior, shots)
+    assert kept < 0.001
+    assert coarse > 0.002  # that derivatives' own lattice would not do
+
+
+@in_float64
+def light_errors(scene: Scene, prior: Prior, shots: Shots) -> tuple[float, float]:
+    """Relative L2 error of samples' light on the fit's lattice and on that of its derivatives."""
+    problem = problem_of(scene, prior, shots, True)
+    evaluator, one, lit = problem.evaluator, problem.samples.at(0), []
+    fine = Lattice(*(2 * size for size in (evaluator.lattice.rows, evaluator.lattice.columns)), 2 * PER_PX, 2 * PER_PX)
+    for lattice in (fine, evaluator.lattice, evaluator.slopes_lattice):
+        same = replace(evaluator, lattice=lattice)
+        overlaps = same.overlaps(prior.mean, one.frame)
+        kernel = np.asarray(same.kernel(prior.mean, one.frame, one.disc_px, overlaps))
+        light = one.sampled(kernel, np.zeros((len(one.rate), 2)), lattice.per_px_x)
+        lit.append(np.einsum("snc,snc->sn", light, one.colour))
+    return tuple(float(np.linalg.norm(light - lit[0]) / np.linalg.norm(lit[0])) for light in lit[1:])
 
 
 @pytest.mark.medium

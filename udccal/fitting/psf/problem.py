@@ -26,6 +26,7 @@ from udccal.fitting.psf.kernel import (
     PITCH,
     PUPIL,
     SLANT,
+    SLOPES_PER_PX,
     Evaluator,
     Kernel,
     Light,
@@ -40,6 +41,8 @@ from udccal.numerics import in_two_threads
 
 # Overlaps of the pupil's footprint change with these parameters.
 _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
+# What of samples is set up about a place, beside the overlaps.
+_SET_UP: Final = ("correction", "by_overlaps", "overlaps_at")
 # The pitch, both openings and the pupil's diameter: none of them is 0 or less.
 _POSITIVE: Final = np.array([PITCH, 1, 2, PUPIL])
 # Logarithms of the corners' radius and of slants.
@@ -161,7 +164,9 @@ class DiffractionProblem:
             return problem
         parts = zip(problem.samples.each(), own[..., :2], strict=True)
         made = in_two_threads(lambda part: _set_up(self.evaluator, theta, *part, near), parts)
-        return replace(self, samples=jax.tree.map(lambda *parts: np.stack(parts), *made))
+        # Overlaps are large: no copy is made of them.
+        set_up = {name: np.stack([getattr(one, name) for one in made]) for name in _SET_UP}
+        return replace(self, samples=replace(problem.samples, **set_up))
 
 
 def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
@@ -225,7 +230,7 @@ def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float
     with jax.enable_x64(False):
         made = evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps)
         coefficients, chain = (np.asarray(part) for part in made)
-    nodes, by_factor = np.split(one.sampled(coefficients, own[:, :2]), [spectra.shape[1]], axis=-1)
+    nodes, by_factor = np.split(one.sampled(coefficients, own[:, :2], SLOPES_PER_PX), [spectra.shape[1]], axis=-1)
     of_colour = one.colour @ spectra
     unit = np.einsum("snj,snj->sn", nodes, of_colour)
     of_own = by_factor.reshape(*unit.shape, -1, 3) * one.colour[:, :, None]
@@ -249,10 +254,9 @@ def _set_up(
     tangent = (np.eye(2) + np.outer(slope, slope)) / one.frame.direction[2]
     along = theta[FOOTPRINT][2] * (one.begun_px + offset_px) @ (tangent @ one.frame.jacobian).T
     correction = np.zeros_like(here)
-    for shot, move in enumerate(along):
-        elsewhere = theta.copy()
-        elsewhere[FOOTPRINT][:2] += move
-        correction[shot] = (light(elsewhere) - here)[shot]
+    for shot, change in enumerate(along):
+        more = np.asarray(evaluator.moved(theta, one.frame, one.disc_px, one.overlaps, change))
+        correction[shot] = one.unit_light(more, offset_px)[shot]
     one = replace(one, overlaps_at=theta[_IN_OVERLAPS], correction=correction)
     if near:
         return one
