@@ -225,10 +225,11 @@ def _refine(
 
     The last round moves nothing by a tenth of a sigma. Descents go to a hundredth of chi-squared once weights stay.
     """
-    whole, enough, damping = None, 1.0, 1e6
+    whole, enough, damping, model_error = None, 1.0, 1e6, 0.0
     problem = problem.about(theta, own)
     place = problem.at(theta, own)
     for _ in range(30):
+        place = problem.with_dropped_begun_again(place, model_error)
         # Weights at the model's light, with the model error of the residuals, and without outliers.
         samples, light, background = problem.samples, place.light, place.own[..., 5:]
         seen, level = samples.known > 0, place.level

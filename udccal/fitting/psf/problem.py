@@ -148,6 +148,20 @@ class DiffractionProblem:
         # The gain is the square of the step's length in sigmas: derivatives hardly change over five of them.
         return self.at(theta, own, place if step.gain < 25.0 else None)
 
+    def with_dropped_begun_again(self, place: Place, model_error: float) -> Place:
+        """Return the place with own parameters of pictures without weight as their samples alone have them.
+
+        A picture that was dropped far from the minimum does not move with the others, and would stay dropped.
+        """
+        dropped = (self.samples.index >= 0) & ~self.samples.weight.any(axis=-1)
+        if not dropped.any():
+            return place
+        own = place.own.copy()
+        for group in np.flatnonzero(dropped.any(axis=1)).tolist():
+            one = self.samples.at(group).weighed(model_error)
+            own[group, dropped[group]] = _own_alone(one, kernel_of(self.evaluator, place.theta, one))[dropped[group]]
+        return self.at(place.theta, own)
+
     def errors(self, place: Place) -> Light:
         """Return data less expectation in units of sigma, 0 for unused samples."""
         return (self.samples.rate - place.level) * np.sqrt(self.samples.weight)
@@ -300,6 +314,19 @@ def _linear(
     return solution[..., 0], (left[..., 0] ** 2).sum(axis=-1)
 
 
+def _own_alone(one: Samples, kernel: Kernel) -> Own:
+    """Fit own parameters of one position's shots to a kernel."""
+    own = start_own(one, kernel)
+    for _ in range(3):
+        unit = one.unit_light(kernel, own[:, :2])
+        by_own = one.own_slopes(own, kernel, unit)
+        residual = one.rate - unit * one.flux(own) - own[:, 5:]
+        across = np.swapaxes(by_own * _huber_weight(residual, one.weight)[..., None], 1, 2)
+        step = scaled_inverse(across @ by_own, 1e-14) @ (across @ residual[..., None])
+        own = _moved_own(own, step[..., 0])
+    return own
+
+
 def explain(
     evaluator: Evaluator, theta: Float[np.ndarray, " p"], shots: Shots, geometry: Geometry, model_error: float
 ) -> tuple[Sources, Crops]:
@@ -311,14 +338,7 @@ def explain(
     def fitted(one: Samples) -> tuple[Own, Light]:
         one = replace(one, overlaps=np.asarray(evaluator.overlaps(theta, one.frame)))
         kernel = kernel_of(evaluator, theta, one)
-        own = start_own(one, kernel)
-        for _ in range(3):
-            unit = one.unit_light(kernel, own[:, :2])
-            by_own = one.own_slopes(own, kernel, unit)
-            residual = one.rate - unit * one.flux(own) - own[:, 5:]
-            across = np.swapaxes(by_own * _huber_weight(residual, one.weight)[..., None], 1, 2)
-            step = scaled_inverse(across @ by_own, 1e-14) @ (across @ residual[..., None])
-            own = _moved_own(own, step[..., 0])
+        own = _own_alone(one, kernel)
         return own, one.unit_light(kernel, own[:, :2])
 
     for index, (own, unit) in zip(samples.index, in_two_threads(fitted, samples.each()), strict=True):
