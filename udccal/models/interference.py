@@ -56,13 +56,12 @@ def interference_transfer(
     """
     fx, fy = lattice_frequencies(frame, lattice)
     columns, rows = slits_of(model, slits_along(model, frame), fx, fy, HIGHEST_ORDER)
-    strength = jnp.asarray(strength)
 
     def add(
         total: Float[Array, "3 rows half"], node: tuple[Array, Array, Array, Array]
     ) -> tuple[Float[Array, "3 rows half"], None]:
         column, row, overlap, part = node
-        down = strength[:, None] * row[ROW_OF]
+        down = jnp.asarray(strength)[:, None] * row[ROW_OF]
         here = jnp.sum(down[:, :, None] * column[COLUMN_OF][:, None, :] * overlap, axis=0)
         return total + part[:, None, None] * here, None
 

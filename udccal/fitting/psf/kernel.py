@@ -358,7 +358,7 @@ class Samples(eqx.Module):
 
         ``here`` is the light per unit by the ``kernel`` at the shots' places; ``changed`` is what is added to it.
         """
-        # Differences over a 250th of the lattice's spacing: a cubic spline has no more detail.
+        # Differences over a 160th of the lattice's spacing: a cubic spline has no more detail.
         step, flux, unit = 1e-3, self.flux(own)[..., None], here + changed
         ahead = [self.unit_light(kernel, own[:, :2] + step * move) for move in np.eye(2)]
         by_move = (np.stack(ahead, axis=-1) - here[..., None]) / step
