@@ -52,10 +52,9 @@ from udccal.models.psf import lattice_points
 from udccal.models.slits import Slits
 
 WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
-# Nodes of a fit's lattices to a pixel, of the kernel and of its derivatives: the light of an LED whose image is a pixel
-# wide then errs by up to 0.3 % (relative L2), with 4 nodes by up to 0.9 %. Errors of derivatives move no minimum.
+# Nodes of a fit's lattice to a pixel: the light of an LED whose image is a pixel wide then errs by up to 0.3 % (relative
+# L2), with 4 nodes by up to 0.9 %. Derivatives need as many: with 4, small blurs ended 9 sigma beside the minimum.
 PER_PX: Final = 6
-SLOPES_PER_PX: Final = 4
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
 # in mm, the logarithm of the blur in px, bars of (columns, rows), logarithms of the corners' radius and of slants of
 # (columns, rows), and the footprint's place on columns and rows with its stand-off, in pitches.
@@ -84,7 +83,7 @@ class Evaluator(eqx.Module):
 
     Attributes:
         wavelengths_nm: nodes of the spectra.
-        lattice: of kernels; see ``fit_lattice``.
+        lattice: of kernels.
         interference: whether the footprint's place on rows is known.
         shaped: whether openings may have bars, round corners and slants. Without, the latter two are left out and bars
             have no derivatives, which saves time.
@@ -154,28 +153,17 @@ class Evaluator(eqx.Module):
         transfer = interference_transfer(model, frame, lattice, model.spectrum, overlaps, more, disc_px)
         return spline_coefficients(lattice, transfer)
 
-    @property
-    def slopes_lattice(self) -> Lattice:
-        """The lattice of derivatives, which has the lower frequencies of the kernel's."""
-        rows, columns = (size // PER_PX * SLOPES_PER_PX for size in (self.lattice.rows, self.lattice.columns))
-        return Lattice(rows, columns, SLOPES_PER_PX, SLOPES_PER_PX)
-
     @eqx.filter_jit
     def jacobian(
         self, theta: Float[Arrayish, " p"], frame: LocalFrame, disc_px: Float[Arrayish, ""], overlaps: Overlaps
     ) -> tuple[Float[Array, "y x channels"], Float[Array, "factors 3 head"]]:
         """Return spline coefficients of the kernel at every wavelength node, and its derivatives by factor and colour.
 
-        They are on ``slopes_lattice``.
-
         Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the
         footprint's place (x, y), bars, corners and slants if there may be any, and the blur's covariance, with the
         ``overlaps`` of interference held. The second result has their derivatives by the parameters before the spectra.
         """
-        model, lattice = self.model(theta), self.slopes_lattice
-        half = lattice.rows // 2
-        overlaps = jnp.asarray(overlaps)[..., : lattice.columns // 2 + 1]
-        overlaps = jnp.concatenate([overlaps[..., :half, :], overlaps[..., -half:, :]], axis=-2)
+        model, lattice = self.model(theta), self.lattice
         spectra, variance = jnp.asarray(model.spectrum), blur_variance(model, frame)
         fx, fy = lattice_frequencies(frame, lattice)
 
@@ -211,7 +199,7 @@ class Evaluator(eqx.Module):
 
         parts = self._parts(model, slits, fx, fy)
         orders = self._tables(lambda m, s: slits_of(m, s, fx, fy, HIGHEST_ORDER), model, slits, 4 if self.shaped else 2)
-        every = jax.lax.map(at_node, (parts, orders, overlaps, pupil_anchors(model)[1].T))
+        every = jax.lax.map(at_node, (parts, orders, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
         # As one product of matrices: an einsum over the nodes takes five times as long.
         mixed = (spectra @ every.reshape(len(every), -1)).reshape(len(spectra), *every.shape[1:])
         by_factor = jax.lax.map(lambda one: one * sensor, jnp.swapaxes(mixed[:, 1:], 0, 1))
@@ -262,10 +250,8 @@ class Evaluator(eqx.Module):
 
 def fit_lattice(half: tuple[int, int]) -> Lattice:
     """Return a fit's lattice, a quarter wider than the window, for sources off the middle."""
-    # Both lattices must have whole numbers of nodes.
     rows, columns = (1.25 * (2 * h + 9) for h in half)
-    coarse = lattice_for(rows, columns, 2, 2)
-    return Lattice(coarse.rows * PER_PX // 2, coarse.columns * PER_PX // 2, PER_PX, PER_PX)
+    return lattice_for(rows, columns, PER_PX, PER_PX)
 
 
 @final
@@ -336,14 +322,14 @@ class Samples(eqx.Module):
         return np.einsum("...snc,...sc->...sn", self.colour, own[..., 2:5])
 
     def sampled(
-        self, coefficients: Float[np.ndarray, "y x c"], offset_px: Float[np.ndarray, "*moves 2"], per_px: int = PER_PX
+        self, coefficients: Float[np.ndarray, "y x c"], offset_px: Float[np.ndarray, "*moves 2"]
     ) -> Float[np.ndarray, "*moves n c"]:
         """Return each sample's light per unit of the LED's light at one position, for every kernel of the coefficients.
 
         The LEDs' offsets from the mean place are of ``shots``, or of any number of moves x shots.
         """
         points = self.points - (offset_px @ self.slope.T)[..., None, :]
-        lattice = Lattice(coefficients.shape[0], coefficients.shape[1], per_px, per_px)
+        lattice = Lattice(coefficients.shape[0], coefficients.shape[1], PER_PX, PER_PX)
         values = sample(lattice, coefficients, points.reshape(-1, 2)).reshape(*points.shape[:-1], -1)
         return np.asarray(values * self.density[..., None])
 

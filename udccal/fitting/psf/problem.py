@@ -26,7 +26,6 @@ from udccal.fitting.psf.kernel import (
     PITCH,
     PUPIL,
     SLANT,
-    SLOPES_PER_PX,
     Evaluator,
     Kernel,
     Light,
@@ -244,7 +243,7 @@ def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float
     with jax.enable_x64(False):
         made = evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps)
         coefficients, chain = (np.asarray(part) for part in made)
-    nodes, by_factor = np.split(one.sampled(coefficients, own[:, :2], SLOPES_PER_PX), [spectra.shape[1]], axis=-1)
+    nodes, by_factor = np.split(one.sampled(coefficients, own[:, :2]), [spectra.shape[1]], axis=-1)
     of_colour = one.colour @ spectra
     unit = np.einsum("snj,snj->sn", nodes, of_colour)
     of_own = by_factor.reshape(*unit.shape, -1, 3) * one.colour[:, :, None]
