@@ -52,8 +52,8 @@ from udccal.models.psf import lattice_points
 from udccal.models.slits import Slits
 
 WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
-# Nodes of a fit's lattice to a pixel. The light of an LED whose image is a pixel wide errs by up to 0.3 % (relative L2),
-# and by up to 0.9 % with 4. Derivatives need as many: with 4, small blurs ended 9 sigma beside the minimum.
+# Nodes of a fit's lattice to a pixel. The light of an LED whose image is a pixel wide errs by up to 0.3 %, and by up to
+# 0.9 % with 4. Derivatives need as many: with 4, small blurs ended 9 sigma beside the minimum.
 PER_PX: Final = 6
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
 # in mm, the logarithm of the blur in px, bars of (columns, rows), logarithms of the corners' radius and of slants of
