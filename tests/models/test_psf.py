@@ -11,24 +11,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.scenes.psf import light_on_lattice
 from udccal.models import psf
 from udccal.models.diffraction import (
     Diffraction,
-    average_transfer,
     disc_autocorrelation,
     local_frame,
     opening_overlaps,
 )
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.models.geometry import Geometry
-from udccal.models.interference import (
-    disc_overlap_coefficient,
-    footprint_place,
-    interference_transfer,
-    node_overlaps,
-    overlap_tables,
-    strengths,
-)
+from udccal.models.interference import disc_overlap_coefficient
 from udccal.models.lattice import lattice_for, sample, spline_coefficients
 from udccal.models.psf import PsfField, psf_kernels, residual_kernel
 from udccal.models.slits import Slits, slit_coefficients, window_overlap
@@ -280,20 +273,13 @@ def kernel_errors(truth: RigTruth) -> tuple[float, float]:
     y, x = np.mgrid[:ROWS, :COLUMNS] - np.array([ROWS // 2, COLUMNS // 2])[:, None, None]
     offsets = jnp.stack([x.ravel(), y.ravel()], axis=-1) * 1.0
 
-    def on_one_lattice(place: jax.Array) -> jax.Array:
-        frame, spectra = local_frame(geometry, place), jnp.asarray(model.spectrum)
-        overlaps = node_overlaps(model, frame, lattice, overlap_tables(model, frame))
-        strength = strengths(model, footprint_place(model, frame))
-        transfer = average_transfer(model, frame, lattice, spectra, shaped=False)
-        transfer += interference_transfer(model, frame, lattice, spectra, overlaps, strength)
-        points, density = psf.lattice_points(geometry, frame, place, offsets)
-        light = sample(lattice, spline_coefficients(lattice, transfer), points) * density[:, None]
-        return light.T.reshape(3, ROWS, COLUMNS)
-
     def kernel(place: jax.Array) -> jax.Array:
         return psf.diffraction_kernel(model, geometry, place, ROWS, COLUMNS, field.fine, False)
 
-    found, wanted = (np.asarray(jax.jit(one)(jnp.array([300.0, 130.0]))) for one in (kernel, on_one_lattice))
+    place = jnp.array([300.0, 130.0])
+    found = np.asarray(jax.jit(kernel)(place))
+    light = light_on_lattice(model, geometry, place, offsets, lattice, shaped=False, disc_px=0.0)
+    wanted = np.asarray(light).T.reshape(found.shape)
     part = wanted / wanted.max(axis=(1, 2), keepdims=True)
     beside = (part > 0.003) & (part < 0.1)
     errors = relative_l2(found[None], wanted[None]).max(), np.sqrt(((found / wanted - 1.0)[beside] ** 2).mean())

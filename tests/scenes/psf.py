@@ -115,21 +115,22 @@ def wire_as_built(rig: RigDescription, geometry: Geometry) -> Wire:
 
 
 @eqx.filter_jit
-def _light(
+def light_on_lattice(
     model: Diffraction,
     geometry: Geometry,
     place: Float[Array, "2"],
     offsets: Float[Array, "n 2"],
     grid: Lattice,
     shaped: bool,
+    disc_px: float = DISC_PX,
 ) -> Float[Array, "n 3"]:
-    """Light per unit of a source at ``place``."""
+    """Light per unit of a source at ``place``, a disc on the sensor."""
     frame = local_frame(geometry, place)
     spectra = jnp.asarray(model.spectrum)
     overlaps = node_overlaps(model, frame, grid, overlap_tables(model, frame))
-    transfer = average_transfer(model, frame, grid, spectra, DISC_PX, shaped=shaped)
+    transfer = average_transfer(model, frame, grid, spectra, disc_px, shaped=shaped)
     strength = strengths(model, footprint_place(model, frame))
-    transfer = transfer + interference_transfer(model, frame, grid, spectra, overlaps, strength, DISC_PX)
+    transfer = transfer + interference_transfer(model, frame, grid, spectra, overlaps, strength, disc_px)
     points, density = lattice_points(geometry, frame, place, offsets)
     return sample(grid, spline_coefficients(grid, transfer), points) * density[:, None]
 
@@ -161,7 +162,7 @@ def pictures(
             corner = (np.round(aim).astype(int) - [columns // 2, rows // 2]) // 2 * 2
             y, x = np.mgrid[:rows, :columns]
             offsets = np.stack([x.ravel(), y.ravel()], axis=-1) + corner - source
-            light = np.asarray(_light(model, scene.geometry, source, offsets, lattice, is_shaped(model)))
+            light = np.asarray(light_on_lattice(model, scene.geometry, source, offsets, lattice, is_shaped(model)))
             light = light.reshape(rows, columns, 3) * FLUX
             rate = np.take_along_axis(light, cfa_named(scene.rig.camera.cfa).channel_map(rows, columns)[..., None], 2)[
                 ..., 0

@@ -258,10 +258,10 @@ def _set_up(
 ) -> Samples:
     """Return one position's samples with interference set up about these parameters; see ``Samples``."""
 
-    def light(theta: Theta, overlaps: np.ndarray = one.overlaps) -> Light:
+    def light(overlaps: np.ndarray) -> Light:
         return one.unit_light(kernel_of(evaluator, theta, replace(one, overlaps=overlaps)), offset_px)
 
-    here = light(theta)
+    here = light(one.overlaps)
     # The pupil's footprint moves with a shot's own place.
     slope = one.frame.direction[:2] / one.frame.direction[2]
     tangent = (np.eye(2) + np.outer(slope, slope)) / one.frame.direction[2]
@@ -278,7 +278,7 @@ def _set_up(
     by_overlaps = []
     for i, step in zip(_IN_OVERLAPS, (2e-4, 1e-3), strict=True):
         moved = np.asarray(evaluator.overlaps(theta + step * np.eye(theta.size)[i], one.frame))
-        by_overlaps.append((light(theta, moved) - here) / step)
+        by_overlaps.append((light(moved) - here) / step)
     return replace(one, by_overlaps=np.stack(by_overlaps, axis=-1))
 
 
