@@ -56,3 +56,18 @@ def test_tiles_whose_values_differ_are_blended_without_a_step() -> None:
     joined = layout.join(values)[..., 0]
     steps = np.abs(np.diff(joined[:, layout.lefts[1] :], axis=1))
     assert steps.max() < 0.15
+
+
+def test_tiles_share_the_kernel_of_their_middle_within_a_fifth_of_the_frame() -> None:
+    layout = layout_for(1536, 2048, (2, 2), (128, 128), (300, 1240))
+    kernels = len(layout.kernel_px)
+    assert layout.kernel.max() == kernels - 1
+    assert kernels < layout.count / 9
+    for number, place in enumerate(layout.kernel_px):
+        mine = layout.centres_px[layout.kernel == number]
+        np.testing.assert_allclose(mine.mean(axis=0), place, atol=2e-3)
+        assert np.all(np.ptp(mine, axis=0) < 0.2 * np.array([2048, 1536]))
+    # So small a frame has a kernel per tile.
+    small = layout_for(300, 400, (2, 2), (128, 128), (0, 300))
+    np.testing.assert_array_equal(small.kernel, np.arange(small.count))
+    np.testing.assert_allclose(small.kernel_px, small.centres_px, atol=2e-3)

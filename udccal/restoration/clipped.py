@@ -91,7 +91,7 @@ def completed(
         tile: signal in e-, backscatter subtracted.
         clipped: samples to replace.
         noise_e: sigma of a sample of each colour in e-.
-        tables: of this tile.
+        tables: of the tile's kernel.
         layout: of the tile.
         pattern: the colour pattern, of sites with places of their own.
         effort: how long likelier values are looked for.

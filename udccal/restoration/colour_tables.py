@@ -44,23 +44,23 @@ THREE_COLOURS: Final = _ThreeColours()
 @final
 @dataclass(frozen=True)
 class ColourTables:
-    """``Tables`` of one tile, or of several, for three colours at every pixel.
+    """``Tables`` of one kernel, or of several, for three colours at every pixel.
 
     Attributes:
         transfer: h, by colour. density: c d, the prior's power of what each colour has for itself, at strength 1.
     """
 
-    transfer: Complex64[np.ndarray, "*tiles 3 rows half"]
+    transfer: Complex64[np.ndarray, "*kernels 3 rows half"]
     density: Float32[np.ndarray, "rows half"]
 
     @property
-    def matched(self) -> Complex64[np.ndarray, "*tiles 1 3 rows half"]:
+    def matched(self) -> Complex64[np.ndarray, "*kernels 1 3 rows half"]:
         """Prior power times the conjugate transfer, as of one place."""
         return (np.conjugate(self.transfer) * (self.density / np.float32(COLOURFUL)))[..., None, :, :, :]
 
-    def at(self, tiles: int | Int[np.ndarray, " some"]) -> ColourTables:
-        """Return the tables of one tile, or of several."""
-        return ColourTables(self.transfer[tiles], self.density)
+    def at(self, kernels: int | Int[np.ndarray, " some"]) -> ColourTables:
+        """Return the tables of one kernel, or of several."""
+        return ColourTables(self.transfer[kernels], self.density)
 
     def along(self, spectra: Complex64[np.ndarray, "3 rows half"]) -> Complex64[np.ndarray, "3 rows half"]:
         """Return the spectra as they are."""
@@ -101,21 +101,21 @@ class ColourTables:
 
 
 def colour_tables(grid: KernelGrid, layout: TileLayout, workers: int) -> ColourTables:
-    """Compute the tables of every tile of pictures with three colours at every pixel.
+    """Compute the tables of every kernel of a layout, for pictures with three colours at every pixel.
 
     Args:
         grid: kernels over the picture.
         layout: the tiles.
         workers: threads.
     """
-    kernels = interpolated_kernels(grid, layout.centres_px)
-    transfer = np.empty((layout.count, 3, layout.rows, layout.columns // 2 + 1), dtype=np.complex64)
+    kernels = interpolated_kernels(grid, layout.kernel_px)
+    transfer = np.empty((len(kernels), 3, layout.rows, layout.columns // 2 + 1), dtype=np.complex64)
 
     def one(index: int) -> None:
         placed = np.stack([centred(kernel, layout.rows, layout.columns) for kernel in kernels[index]])
         transfer[index] = fft.rfft2(placed.astype(np.float32))
 
     with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(one, range(layout.count)))
+        list(pool.map(one, range(len(kernels))))
     density = COLOURFUL * prior_density(layout.rows, layout.columns)[:, : transfer.shape[3]]
     return ColourTables(transfer, density.astype(np.float32))

@@ -48,7 +48,7 @@ def deblur(
     kernels: Float[np.ndarray, "..."],
     x_px: Float[np.ndarray, "..."],
     y_px: Float[np.ndarray, "..."],
-    tile_px: int = 256,
+    tile_px: int = 192,
     workers: int = 2,
     tier: Tier | str = Tier.balanced,
 ) -> Float32[np.ndarray, "rows columns 3"]:
@@ -82,7 +82,7 @@ def deblur(
     unit = float(np.max(np.abs(picture), initial=0.0)) or 1.0
     light = np.ascontiguousarray(picture / unit, dtype=np.float32)
     rows, columns = light.shape[:2]
-    layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows), GENERAL)
+    layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows), GENERAL, shared=0.0)
     tiles = _cut(light, layout)
     read, slope = _noise_line(tiles, _finest(rows, columns))
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), _LEAST_VARIANCE)).astype(np.float32)

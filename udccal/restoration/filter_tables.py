@@ -28,7 +28,7 @@ SPARSE = 3
 @final
 @dataclass(frozen=True)
 class FilterTables:
-    """The tables of the kernels of one tile, or of several, of a mosaic.
+    """The tables of one kernel, or of several.
 
     Attributes:
         matched: transfer from each site plane of the mosaic to the picture's plane at each place of the cell: prior
@@ -37,13 +37,13 @@ class FilterTables:
         values: lambda, in units of the noise.
     """
 
-    matched: Complex64[np.ndarray, "*tiles places sites site_rows site_half"]
-    vectors: Complex64[np.ndarray, "*tiles sites sites site_rows site_half"]
-    values: Float32[np.ndarray, "*tiles sites site_rows site_half"]
+    matched: Complex64[np.ndarray, "*kernels places sites site_rows site_half"]
+    vectors: Complex64[np.ndarray, "*kernels sites sites site_rows site_half"]
+    values: Float32[np.ndarray, "*kernels sites site_rows site_half"]
 
-    def at(self, tiles: int | Int[np.ndarray, " some"]) -> FilterTables:
-        """Return the tables of one tile, or of several."""
-        return FilterTables(self.matched[tiles], self.vectors[tiles], self.values[tiles])
+    def at(self, kernels: int | Int[np.ndarray, " some"]) -> FilterTables:
+        """Return the tables of one kernel, or of several."""
+        return FilterTables(self.matched[kernels], self.vectors[kernels], self.values[kernels])
 
     def along(self, spectra: Complex64[np.ndarray, "sites rows half"]) -> Complex64[np.ndarray, "sites rows half"]:
         """Return V Y: along the eigenvectors."""
@@ -80,7 +80,7 @@ def power_of(values: Complex64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*s
 
 
 def filter_tables(grid: KernelGrid, layout: TileLayout, pattern: Pattern, workers: int) -> FilterTables:
-    """Compute the tables of every tile of a mosaic.
+    """Compute the tables of every kernel of a layout.
 
     Args:
         grid: kernels over the sensor.
@@ -88,7 +88,7 @@ def filter_tables(grid: KernelGrid, layout: TileLayout, pattern: Pattern, worker
         pattern: the colour pattern, whose cell divides the tiles.
         workers: threads.
     """
-    kernels = interpolated_kernels(grid, layout.centres_px)
+    kernels = interpolated_kernels(grid, layout.kernel_px)
     density = prior_density(layout.rows, layout.columns)
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda kernel: _tables_of(kernel, density, pattern), kernels))

@@ -97,7 +97,7 @@ def expected_error(
     apart = {Tier.preview: _apart(quick, best), Tier.fast: _apart(found, best)}
     flatness = min(_flatness(encode_srgb(balanced / white_e)), _FLATTEST)
     part = _FLAT * flatness**_EXPONENT + _COARSE / (1 + solved.strengths)
-    of_tile = lost.variance[np.arange(len(part)), np.searchsorted(STRENGTHS, solved.strengths)] * part[:, None]
+    of_tile = lost.variance[sharpener.layout.kernel, np.searchsorted(STRENGTHS, solved.strengths)] * part[:, None]
     return ExpectedError(*_at_places(sharpener, solved, of_tile, white_e), apart)
 
 

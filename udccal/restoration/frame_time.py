@@ -160,7 +160,7 @@ def _measured(options: PlanOptions) -> PartTimes:
 
     def completion(effort: Effort) -> None:
         def one(index: int) -> None:
-            completed(tiles[index], clipped, unit[index], tables.at(index), layout, cfa, effort)
+            completed(tiles[index], clipped, unit[index], tables.at(int(layout.kernel[index])), layout, cfa, effort)
 
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(one, range(layout.count)))
@@ -187,7 +187,7 @@ def _like_tables(layout: TileLayout, cfa: Cfa, rng: np.random.Generator) -> Filt
     """Return tables of the right shapes; the numbers do not matter to their time."""
     sites = len(cfa.sites)
     planes = layout.rows // cfa.rows, layout.columns // cfa.columns // 2 + 1
-    square = rng.standard_normal((layout.count, sites, sites, *planes)).astype(np.complex64)
+    square = rng.standard_normal((layout.kernel[-1] + 1, sites, sites, *planes)).astype(np.complex64)
     return FilterTables(square, square, np.abs(square[:, 0]).astype(np.float32))
 
 

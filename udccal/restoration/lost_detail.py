@@ -1,4 +1,4 @@
-"""The detail that the filter of each tile is expected to lose: what it takes for noise.
+"""The detail that a tile's filter is expected to lose: what it takes for noise.
 
 With the words of ``mosaic_filter`` and W = s S A^H (s B + 1)^-1: where cov X = s S, the filter's error has the
 covariance s S - W A s S. Part of it is noise that passed, W W^H; the rest is lost detail. It is a variance of a
@@ -26,20 +26,20 @@ _SPARSE: Final = 3
 @final
 @dataclass(frozen=True)
 class LostDetail:
-    """What each tile's filter loses.
+    """What the filter of each kernel loses.
 
     Attributes:
         variance: of detail under the prior, by strength of the prior and colour.
     """
 
-    variance: Float32[np.ndarray, "tiles strengths 3"]
+    variance: Float32[np.ndarray, "kernels strengths 3"]
 
 
 def lost_detail(tables: FilterTables, layout: TileLayout, cfa: Cfa) -> LostDetail:
-    """Evaluate the detail that is lost in every tile.
+    """Evaluate the detail that is lost with every kernel.
 
     Args:
-        tables: of the tiles' filters.
+        tables: of the filters.
         layout: the tiles.
         cfa: the colour pattern.
     """
@@ -54,7 +54,7 @@ def lost_detail(tables: FilterTables, layout: TileLayout, cfa: Cfa) -> LostDetai
 def _lost(
     matched: np.ndarray, vectors: np.ndarray, values: np.ndarray, density: Float64[np.ndarray, "rows columns"], cfa: Cfa
 ) -> Float64[np.ndarray, "strengths 3"]:
-    """Return the detail that one tile's filter loses."""
+    """Return the detail that one kernel's filter loses."""
     rows, columns = density.shape
     down, across = (
         axis.ravel()

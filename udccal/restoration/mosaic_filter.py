@@ -62,11 +62,11 @@ class Tables(Protocol):
     """What the filter needs of the kernels: of a mosaic, ``FilterTables``; of whole colours, ``ColourTables``."""
 
     @property
-    def matched(self) -> Complex64[np.ndarray, "*tiles places sites site_rows site_half"]:
+    def matched(self) -> Complex64[np.ndarray, "*kernels places sites site_rows site_half"]:
         """Transfer from each site plane to the picture's plane at each place of the cell."""
 
-    def at(self, tiles: int | Int[np.ndarray, " some"]) -> Tables:
-        """Return the tables of one tile, or of several."""
+    def at(self, kernels: int | Int[np.ndarray, " some"]) -> Tables:
+        """Return the tables of one kernel, or of several."""
 
     def along(self, spectra: Complex64[np.ndarray, "sites rows half"]) -> Complex64[np.ndarray, "sites rows half"]:
         """Return the site planes' spectra in the coordinates that the other methods work in."""
@@ -96,8 +96,8 @@ def filtered(
     Args:
         tiles: signal in e-, backscatter subtracted; with an axis of colours where the pattern's sites share a place.
         noise_e: sigma of a sample of each colour in e-.
-        tables: of the same tiles.
-        layout: of the same tiles.
+        tables: of each tile's kernel.
+        layout: of the tiles.
         pattern: the colour pattern.
         workers: threads.
         strengths: of each tile's prior; None to choose the likeliest.
@@ -106,7 +106,7 @@ def filtered(
         pictures in e-, and the strength of the prior that each tile chose, in units of its noise.
     """
     pictures = np.empty((len(tiles), layout.rows, layout.columns, 3), dtype=np.float32)
-    given = tiles, noise_e, tables, layout, pattern, workers, strengths
+    given = tiles, noise_e, tables.at, layout, pattern, workers, strengths
     return pictures, _filter_each(*given, [range(len(tiles))], pictures.__setitem__)
 
 
@@ -121,10 +121,11 @@ def filtered_and_joined(
 ) -> tuple[Float32[np.ndarray, "covered_rows frame_columns 3"], Float32[np.ndarray, " tiles"]]:
     """Demosaic and deblur all tiles of a layout, and blend their pictures into one.
 
-    Every picture is blended while a core's cache has it. Arguments and strengths are those of ``filtered``.
+    Every picture is blended while a core's cache has it. Arguments and strengths are those of ``filtered``, but that
+    ``tables`` are those of the layout's kernels.
     """
     joined = np.zeros((*layout.covered, 3), dtype=np.float32)
-    given = tiles, noise_e, tables, layout, pattern, workers, strengths
+    given = tiles, noise_e, lambda index: tables.at(int(layout.kernel[index])), layout, pattern, workers, strengths
     return joined, _filter_each(*given, layout.apart, lambda index, picture: layout.blend(picture, index, joined))
 
 
@@ -143,7 +144,7 @@ def likeliest_strength(
 def _filter_each(
     tiles: Tiles,
     noise_e: Float32[np.ndarray, "tiles 3"],
-    tables: Tables,
+    tables_of: Callable[[int], Tables],
     layout: TileLayout,
     pattern: Pattern,
     workers: int,
@@ -155,7 +156,7 @@ def _filter_each(
     chosen = np.empty(len(tiles), dtype=np.float32)
 
     def one(index: int) -> None:
-        own = noise_e[index], tables.at(index), layout, pattern, None if strengths is None else strengths[index]
+        own = noise_e[index], tables_of(index), layout, pattern, None if strengths is None else strengths[index]
         picture, chosen[index] = _filtered_tile(tiles[index], *own)
         take(index, picture)
 

@@ -40,7 +40,8 @@ class PlanOptions:
         kernel_rows, kernel_columns: largest size of the kernels in px, odd. A smaller sensor, or a psf with less
             support, gets smaller kernels.
         grid_rows, grid_columns: field positions at which the psf is evaluated.
-        tile_rows, tile_columns: size in px of the tiles, each of which has one kernel and one prior.
+        tile_rows, tile_columns: size in px of the tiles, each of which has one prior; those within a fifth of the
+            frame share a kernel.
         interpolation: with which sharp pictures are resampled onto the view.
         network_views: ways round in which the network of the tier ``accurate`` sees the picture, 1 to 4.
         workers: threads of the Fourier transforms.
@@ -53,8 +54,8 @@ class PlanOptions:
     kernel_columns: int = KERNEL_COLUMNS
     grid_rows: int = 7
     grid_columns: int = 9
-    tile_rows: int = 256
-    tile_columns: int = 224
+    tile_rows: int = 160
+    tile_columns: int = 160
     interpolation: Interpolation = Interpolation.CUBIC
     network_views: int = 4
     workers: int = 2

@@ -63,7 +63,7 @@ class Sharpener:
         grid: kernels over the sensor.
         rig: the rig description.
         layout: the tiles.
-        tables: of the tiles' filters.
+        tables: of the filters, by kernel.
         noise: what the filters leave of noise; None for the tier fast, which does not take it out.
         options: options of the restoration.
     """
@@ -152,7 +152,7 @@ class Sharpener:
             effort = effort_of(self.tier)
 
             def whole(index: int, own: Clipped) -> Mosaic:
-                given = noise_e[index], self.tables.at(index), self.layout, self.cfa, effort
+                given = noise_e[index], self.tables.at(int(self.layout.kernel[index])), self.layout, self.cfa, effort
                 return completed(tiles[index], own, *given)
 
             with ThreadPoolExecutor(self.options.workers) as pool:

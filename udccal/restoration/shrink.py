@@ -68,7 +68,7 @@ def measured_noise(
     """Filter noise at strengths of the prior, and measure what is left of it in each band.
 
     Args:
-        tables: of the tiles.
+        tables: of the layout's kernels.
         layout: of the tiles.
         pattern: the colour pattern.
         workers: threads.
@@ -86,7 +86,8 @@ def measured_noise(
     noise = np.random.default_rng(0x5EED).standard_normal(shape, dtype=np.float32)
     tiles = np.repeat(noise, len(strengths), axis=0)
     unit = np.ones((len(tiles), 3), dtype=np.float32)
-    pictures, _ = filtered(tiles, unit, tables.at(repeated), layout, pattern, workers, np.tile(strengths, len(chosen)))
+    own, repeated_strengths = tables.at(layout.kernel[repeated]), np.tile(strengths, len(chosen))
+    pictures, _ = filtered(tiles, unit, own, layout, pattern, workers, repeated_strengths)
     whole = tuple(slice(ends.both, -ends.both) for ends in (layout.down, layout.across))
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda picture: _band_variances(picture[whole]), pictures))

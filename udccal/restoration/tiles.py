@@ -1,4 +1,6 @@
-"""A mosaic in overlapping tiles, each small enough for one kernel and one brightness, and their pictures joined again.
+"""A mosaic in overlapping tiles, each small enough for one brightness, and their pictures joined again.
+
+Neighbouring tiles may share a kernel.
 
 A tile's border is tapered before its transform, so that opposite edges meet at zero; only what the taper leaves whole
 is used. There, neighbouring tiles are blended.
@@ -13,11 +15,13 @@ from typing import Final, final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int, Real, Shaped
+from jaxtyping import Float32, Float64, Int, Real, Shaped
 from scipy import fft
 
 from udccal.errors import RestorationError
 
+# Part of the frame within which tiles share a kernel: behind a display, kernels vary more slowly than a scene does.
+SHARED: Final = 0.2
 # A tile's part that is neither tapered nor blended must hold the bands of its noise.
 _LEAST_WHOLE_PX: Final = 16
 
@@ -82,6 +86,7 @@ class TileLayout:
         frame_columns: the frame's columns; all are covered.
         cell_rows, cell_columns: the colour pattern's cell; every tile starts at the beginning of one.
         down, across: ends of a tile.
+        shared: part of the frame within which neighbouring tiles share a kernel; 0 for a kernel each.
     """
 
     rows: int
@@ -94,6 +99,7 @@ class TileLayout:
     cell_columns: int
     down: Margins = BEHIND_A_DISPLAY[0]
     across: Margins = BEHIND_A_DISPLAY[1]
+    shared: float = SHARED
 
     @functools.cached_property
     def tops(self) -> tuple[int, ...]:
@@ -117,6 +123,39 @@ class TileLayout:
             np.array(starts) + (size - 1) / 2 for starts, size in ((self.tops, self.rows), (self.lefts, self.columns))
         )
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float32)
+
+    @functools.cached_property
+    def kernel(self) -> Int[np.ndarray, " tiles"]:
+        """Number of each tile's kernel; kernels are numbered row by row."""
+        down, across = self._kernels
+        return (down[:, None] * (across[-1] + 1) + across).ravel()
+
+    @functools.cached_property
+    def _kernels(self) -> tuple[Int[np.ndarray, " tiles_down"], Int[np.ndarray, " tiles_across"]]:
+        """Row of kernels of each row of tiles, and column of each column."""
+        down, across = (
+            np.arange(len(starts)) // max(1, int(self.shared * most / _step(*tile)))
+            for starts, most, tile in (
+                (self.tops, self.frame_rows, (self.rows, self.cell_rows, self.down)),
+                (self.lefts, self.frame_columns, (self.columns, self.cell_columns, self.across)),
+            )
+        )
+        return down, across
+
+    @property
+    def kernel_middles(self) -> tuple[Float64[np.ndarray, " kernels_down"], Float64[np.ndarray, " kernels_across"]]:
+        """Where kernels are evaluated, in px of the joined picture: in the middle of the tiles that share one."""
+        down, across = (
+            np.bincount(own, [strip.middle for strip in strips]) / np.bincount(own)
+            for own, strips in zip(self._kernels, self.strips, strict=True)
+        )
+        return down, across
+
+    @property
+    def kernel_px(self) -> Float64[np.ndarray, "kernels 2"]:
+        """The same on the sensor, as (x, y)."""
+        down, across = self.kernel_middles
+        return np.stack(np.meshgrid(across, down + self.first_row), axis=-1).reshape(-1, 2)
 
     @functools.cached_property
     def taper(self) -> Float32[np.ndarray, "rows columns"]:
@@ -228,6 +267,7 @@ def layout_for(
     largest: tuple[int, int],
     rows: tuple[int, int],
     margins: tuple[Margins, Margins] = BEHIND_A_DISPLAY,
+    shared: float = SHARED,
 ) -> TileLayout:
     """Return the tiles that cover the ``rows`` (first, past the last) of a frame: as few as possible, then as small.
 
@@ -237,6 +277,7 @@ def layout_for(
         largest: (rows, columns) of a tile at most, rounded up to whole cells.
         rows: first row to be covered, and the row after the last one.
         margins: ends of a tile, down and across.
+        shared: part of the frame within which neighbouring tiles share a kernel; 0 for a kernel each.
 
     Raises:
         RestorationError: when a tile is too small to have a part that is neither tapered nor blended.
@@ -250,7 +291,7 @@ def layout_for(
     down, across = margins
     height = _fitted(last - first, largest[0], cell[0], down)
     width = _fitted(frame_columns, largest[1], cell[1], across)
-    return TileLayout(height, width, first, last, frame_rows, frame_columns, *cell, down, across)
+    return TileLayout(height, width, first, last, frame_rows, frame_columns, *cell, down, across, shared)
 
 
 def _fitted(span: int, largest: int, cell: int, ends: Margins) -> int:
@@ -261,9 +302,14 @@ def _fitted(span: int, largest: int, cell: int, ends: Margins) -> int:
     return min(most, cell * int(fft.next_fast_len(-(-needed // cell), real=True)))
 
 
+def _step(size: int, cell: int, ends: Margins) -> int:
+    """Return how far from each other tiles start."""
+    return (size - 2 * ends.outside) // cell * cell
+
+
 def _starts(first: int, last: int, size: int, cell: int, ends: Margins) -> tuple[int, ...]:
     """Return where tiles start so that their inner parts cover [first, last), a constant step apart."""
-    step = (size - 2 * ends.outside) // cell * cell
+    step = _step(size, cell, ends)
     start = -(-(first - ends.outside - cell + 1) // cell) * cell
     count = max(1, -(-(last - first + cell) // step))
     return tuple(start + step * index for index in range(count))

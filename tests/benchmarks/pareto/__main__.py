@@ -60,7 +60,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         found = measured(name, profile, seen, options.out, Path(folder), peers, say)
         some = [sight for sight in seen.usual if sight.case.group is Group.nineteen][::_CHOICES_EVERY]
-        choices = traded_table(traded(name, some, found.runs, kept_of(Path(folder))))
+        choices = traded_table(traded(name, some, kept_of(Path(folder))))
         say("choices are traded")
     _write(found, choices, options)
     return 0 if all(row.ok for row in found.rows) else 1

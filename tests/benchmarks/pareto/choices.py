@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from tests.benchmarks.pareto.restoring import Setup, TierProcess
-from tests.benchmarks.pareto.runs import Run, Sight
+from tests.benchmarks.pareto.runs import Sight
 from udccal.restoration.metrics import psnr
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.rectify import Interpolation
@@ -32,7 +33,7 @@ CHOICES: Final = (
     Choice(Tier.balanced, "interpolation: LINEAR", PlanOptions(interpolation=Interpolation.LINEAR)),
     Choice(Tier.balanced, "interpolation: LANCZOS", PlanOptions(interpolation=Interpolation.LANCZOS)),
     Choice(Tier.balanced, "tiles of 128 x 128", PlanOptions(tile_rows=128, tile_columns=128)),
-    Choice(Tier.balanced, "tiles of 512 x 512", PlanOptions(tile_rows=512, tile_columns=512)),
+    Choice(Tier.balanced, "tiles of 256 x 256", PlanOptions(tile_rows=256, tile_columns=256)),
     Choice(Tier.balanced, "kernels at 4 x 5 places", PlanOptions(grid_rows=4, grid_columns=5)),
     Choice(Tier.accurate, "network_views: 1", PlanOptions(network_views=1)),
     Choice(Tier.accurate, "network_views: 2", PlanOptions(network_views=2)),
@@ -41,35 +42,37 @@ CHOICES: Final = (
 
 @dataclass(frozen=True)
 class Traded:
-    """dB of each scene less the default's, and CPU time over the default's."""
+    """dB of each scene less the default's, and CPU time over the default's, the median of the scenes."""
 
     choice: Choice
     gains_dB: tuple[float, ...]
     cpu_ratio: float
 
 
-def traded(profile: str, sights: Sequence[Sight], runs: Iterable[Run], keep: Path) -> list[Traded]:
+def traded(profile: str, sights: Sequence[Sight], keep: Path) -> list[Traded]:
     """Measure every choice on some sights.
+
+    The default restores each sight beside the choice: a computer's speed changes in minutes.
 
     Args:
         profile: its path or name.
         sights: of the nineteen.
-        runs: of the defaults on the same sights.
         keep: folder of prepared arrays.
     """
-    defaults = {(run.tier, run.group, run.scene): run for run in runs}
     found = []
     for choice in CHOICES:
-        gains, cpu, default_cpu = [], [], []
-        with TierProcess(Setup(profile, choice.tier, choice.options, keep)) as process:
-            process.ready_s(sights[0].taken)
+        gains, ratios = [], []
+        setups = (Setup(profile, choice.tier, options, keep) for options in (PlanOptions(), choice.options))
+        with contextlib.ExitStack() as stack:
+            default, process = (stack.enter_context(TierProcess(setup)) for setup in setups)
+            for one in (default, process):
+                one.ready_s(sights[0].taken)
             for sight in sights:
-                restored = process.restored(sight.taken)
-                default = defaults[choice.tier, sight.case.group, sight.case.shot.name]
-                gains.append(psnr(sight.after(restored.linear), sight.truth) - default.after_dB)
-                cpu.append(restored.cost.cpu_ms)
-                default_cpu.append(default.cpu_ms)
-        found.append(Traded(choice, tuple(gains), statistics.median(cpu) / statistics.median(default_cpu)))
+                before, restored = default.restored(sight.taken), process.restored(sight.taken)
+                of_default, own = (psnr(sight.after(one.linear), sight.truth) for one in (before, restored))
+                gains.append(own - of_default)
+                ratios.append(restored.cost.cpu_ms / before.cost.cpu_ms)
+        found.append(Traded(choice, tuple(gains), statistics.median(ratios)))
     return found
 
 

@@ -96,12 +96,12 @@ def refined(weights: Weights, pictures: list[Planes], noise: Noise, layout: Tile
     return balanced + jnp.moveaxis(mean[inner], -1, 0) * scale
 
 
-def blurred(picture: Planes, kernels: Float[Array, "tiles 3 ky kx"], layout: TileLayout) -> Planes:
-    """Blur a sharp picture as ``blur.blurred`` does, by the kernels of the tiles, of odd size."""
+def blurred(picture: Planes, kernels: Float[Array, "kernels 3 ky kx"], layout: TileLayout) -> Planes:
+    """Blur a sharp picture as ``blur.blurred`` does, by the kernels of the layout, of odd size."""
     places, weights, blends, size = [], [], [], []
-    for strips, count, samples in zip(layout.strips, layout.covered, kernels.shape[2:], strict=True):
+    for middles, count, samples in zip(layout.kernel_middles, layout.covered, kernels.shape[2:], strict=True):
         reach = samples // 2
-        hat = linear_weights(np.array([strip.middle for strip in strips]), np.arange(-reach, count + reach))
+        hat = linear_weights(middles, np.arange(-reach, count + reach))
         most = int(np.count_nonzero(hat, axis=0).max())
         at = np.minimum((hat > 0).argmax(axis=0), len(hat) - most)[:, None] + np.arange(most)
         places.append(np.pad(np.arange(count), reach, mode="symmetric")[at])

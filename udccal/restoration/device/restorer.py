@@ -136,7 +136,7 @@ class DeviceRestorer:
                 f"Expected frames of whole {cfa.columns} x {cfa.rows} cells, found {camera.columns} x {camera.rows} "
                 "samples. Use Restorer.display."
             )
-        tables, kernels = sharpener.tables, interpolated_kernels(sharpener.grid, layout.centres_px)
+        tables, kernels = sharpener.tables.at(layout.kernel), interpolated_kernels(sharpener.grid, layout.kernel_px)
         white, error = (None, 0.0) if restorer.mask is None else (restorer.mask.white, restorer.mask.error)
         pixel, index = restorer.rectification.from_row(layout.first_row).fixed
         before, taps = interpolation_taps(options.interpolation)

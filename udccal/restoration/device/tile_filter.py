@@ -44,7 +44,7 @@ class Whitened(eqx.Module):
 
 
 class TileFilter(eqx.Module):
-    """The tables of all tiles.
+    """The tables of every tile's kernel.
 
     Attributes:
         matched, vectors, values: as in ``FilterTables``. layout: of the tiles. cfa: the colour pattern.
