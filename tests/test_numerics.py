@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import threading
 
 import jax.numpy as jnp
@@ -70,3 +71,24 @@ def test_two_threads_share_the_parts() -> None:
 def test_an_error_of_a_part_is_raised() -> None:
     with pytest.raises(ZeroDivisionError):
         in_two_threads(lambda number: 1 / (number - 3), range(6))
+
+
+@pytest.mark.timeout(60)
+def test_parts_within_parts_wait_for_no_thread() -> None:
+    def row(number: int) -> list[int]:
+        return in_two_threads(lambda other: number * other, range(4))
+
+    assert in_two_threads(row, range(6)) == [[number * other for other in range(4)] for number in range(6)]
+
+
+def tens() -> None:
+    assert in_two_threads(lambda number: 10 * number, range(4)) == [0, 10, 20, 30]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork")
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    tens()
+    child = multiprocessing.get_context("fork").Process(target=tens)
+    child.start()
+    child.join(30)
+    assert child.exitcode == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar, copy_context
@@ -58,11 +59,15 @@ def _one_blas_thread() -> Iterator[None]:
         _ALREADY.reset(before)
 
 
+_WITHIN: ContextVar[bool] = ContextVar("within_two_threads", default=False)
+
+
 def in_two_threads(function: Callable[[Part], T], parts: Iterable[Part]) -> list[T]:
     """Results of a function of every part, in order, in double precision, by two threads.
 
     Compiled functions and loops of numpy let the other thread run. The first part is alone, so that what it compiles is
-    compiled once. More threads would need more memory, and most of them would wait for the interpreter.
+    compiled once. More threads would need more memory, and most of them would wait for the interpreter. Within one of
+    the two threads, parts follow each other.
 
     Args:
         function: returns numpy arrays; it must not change what parts have in common.
@@ -70,9 +75,20 @@ def in_two_threads(function: Callable[[Part], T], parts: Iterable[Part]) -> list
     """
     made, (first, *others) = in_float64(function), parts
     found = made(first)
-    if not others:
-        return [found]
+    if _WITHIN.get():
+        return [found, *map(made, others)]
+    before = _WITHIN.set(True)
     # The threads know by their context that BLAS is limited already: to limit it takes as long as a small part.
     contexts = [copy_context() for _ in others]
-    with ThreadPoolExecutor(2) as pool:
-        return [found, *pool.map(lambda context, part: context.run(made, part), contexts, others)]
+    _WITHIN.reset(before)
+    return [found, *_pool().map(lambda context, part: context.run(made, part), contexts, others)]
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    """Return the same two threads in every call: the C library keeps memory that each new thread has freed."""
+    return ThreadPoolExecutor(2)
+
+
+# A forked process has none of its parent's threads.
+os.register_at_fork(after_in_child=_pool.cache_clear)

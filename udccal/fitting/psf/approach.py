@@ -46,7 +46,10 @@ _FAR_SIGMA = 4.0
 @final
 @dataclass(frozen=True)
 class Approach:
-    """A problem with weights by the data, and where a first descent ended."""
+    """A problem with weights by the data, and where a first descent ended.
+
+    Overlaps of the prior's mean are large. An ``attempt`` leaves them behind: what follows sets them up about the end.
+    """
 
     problem: DiffractionProblem
     end: Solution[Place, Blocks]
@@ -63,7 +66,8 @@ class Approach:
         corners = ["round corners and slants"] * self.problem.evaluator.shaped
         unknowns = self.problem.unknowns + _OF_SHAPE * len(corners) + _OF_BAR * len(bars)
         criterion = bic(self.end.equations.cost, float(unknowns), self.problem.used)
-        return Attempt(f"{', '.join([*corners, *bars]) or 'plain openings'} (BIC)", unknowns, criterion, self)
+        left = replace(self, problem=replace(self.problem, samples=self.problem.samples.without_overlaps()))
+        return Attempt(f"{', '.join([*corners, *bars]) or 'plain openings'} (BIC)", unknowns, criterion, left)
 
 
 def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
@@ -107,8 +111,9 @@ def approach_without_error(problem: DiffractionProblem, rules: PsfRules) -> Solu
 
     Where the wire's footprint is of a wrong width, a model error as large as the residuals there lets the place fit.
     """
-    held, _ = with_place_held(problem, problem.prior.mean)
-    return _from_mean(replace(held, samples=problem.samples.weighed(0.0)), rules).end
+    mean = problem.prior.mean
+    held, _ = with_place_held(replace(problem, samples=problem.samples.weighed(0.0)), mean)
+    return _from_mean(held.with_overlaps(mean), rules).end
 
 
 def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Approach:

@@ -160,8 +160,8 @@ def fit_diffraction(
     """
     chosen, lattice = choose_samples(shots, rules), fit_lattice(rules.close(shots.half))
     evaluator = Evaluator(np.asarray(start.wavelengths_nm), lattice, bool(start.visibility))
-    problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
-    shape = approach(problem, rules)
+    problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior)
+    shape = approach(problem.with_overlaps(prior.mean), rules)
     for attempt in sorted(shape.tried, key=lambda one: one.criterion):
         fit = replace(_finish(attempt.fit, shots, geometry, chosen, rules), shape=Choice(attempt, shape.tried))
         # A bar that vanishes at the minimum was none.

@@ -298,6 +298,10 @@ class Samples(eqx.Module):
         """Return the samples of every position."""
         return [self.at(position) for position in range(len(self.index))]
 
+    def without_overlaps(self) -> Samples:
+        """Return the samples with overlaps empty, as before they are set."""
+        return replace(self, overlaps=np.zeros((len(self.index), 0, 0, 0, 0), dtype=np.float32))
+
     def nearest(self, count: int) -> Samples:
         """Return so many samples of every shot, of one position: those next to the mean place."""
         order = np.argsort((self.points**2).sum(axis=-1), axis=-1, kind="stable")

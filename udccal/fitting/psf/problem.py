@@ -36,6 +36,7 @@ from udccal.fitting.psf.kernel import (
     gather,
 )
 from udccal.models.geometry import Geometry
+from udccal.models.interference import TERMS
 from udccal.numerics import in_two_threads
 
 # Overlaps of the pupil's footprint change with these parameters.
@@ -155,11 +156,15 @@ class DiffractionProblem:
         dropped = (self.samples.index >= 0) & ~self.samples.weight.any(axis=-1)
         if not dropped.any():
             return place
-        own = place.own.copy()
-        for group in np.flatnonzero(dropped.any(axis=1)).tolist():
+        own, groups = place.own.copy(), np.flatnonzero(dropped.any(axis=1))
+        for group in groups.tolist():
             one = self.samples.at(group).weighed(model_error)
             own[group, dropped[group]] = _own_alone(one, kernel_of(self.evaluator, place.theta, one))[dropped[group]]
-        return self.at(place.theta, own)
+        made = replace(self, samples=self.samples.at(groups)).at(place.theta, own[groups])
+        changed = {name: getattr(place, name).copy() for name in ("light", "by_theta", "by_own")}
+        for name, values in changed.items():
+            values[groups] = getattr(made, name)
+        return replace(place, own=own, **changed)
 
     def errors(self, place: Place) -> Light:
         """Return data less expectation in units of sigma, 0 for unused samples."""
@@ -167,8 +172,16 @@ class DiffractionProblem:
 
     def with_overlaps(self, theta: Float[np.ndarray, " p"]) -> DiffractionProblem:
         """Set the overlaps to those of ``theta``: they hardly change in a descent."""
-        found = in_two_threads(lambda one: np.asarray(self.evaluator.overlaps(theta, one.frame)), self.samples.each())
-        return replace(self, samples=replace(self.samples, overlaps=np.stack(found)))
+        evaluator, lattice = self.evaluator, self.evaluator.lattice
+        of_nodes = len(evaluator.wavelengths_nm), len(TERMS) if evaluator.interference else 0
+        # They are large: none is made twice.
+        found = np.empty((len(self.samples.index), *of_nodes, lattice.rows, lattice.columns // 2 + 1), np.float32)
+
+        def make(position: int) -> None:
+            found[position] = evaluator.overlaps(theta, self.samples.at(position).frame)
+
+        in_two_threads(make, range(len(found)))
+        return replace(self, samples=replace(self.samples, overlaps=found))
 
     def about(self, theta: Theta, own: Own, near: bool = False) -> DiffractionProblem:
         """Set interference up about these parameters; ``near`` the last ones, derivatives by overlaps stay."""
