@@ -30,6 +30,7 @@ from udccal.fitting.psf.kernel import (
     Own,
     Samples,
     Theta,
+    coarser,
 )
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
 from udccal.numerics import in_two_threads
@@ -82,9 +83,9 @@ def approach(problem: DiffractionProblem, rules: PsfRules) -> Choice[Approach]:
     if plain.cost_per_sample > rules.shaped_from:
         prior = shaped_prior(problem.prior, rules)
         attempts.append(_descended(replace(shaped, prior=prior), prior.mean, own, rules).attempt())
-    if choose(attempts).best.fit.cost_per_sample > rules.shaped_from:
-        barred = _with_bar(shaped, own, rules)
-        if barred.end.place.theta[BAR_WIDTH].max() > rules.least_bar:
+    if (best := choose(attempts).best.fit).cost_per_sample > rules.shaped_from:
+        barred = _with_bar(shaped, best, own, rules)
+        if barred is not None and barred.end.place.theta[BAR_WIDTH].max() > rules.least_bar:
             attempts.append(barred.attempt())
     return choose(attempts)
 
@@ -132,14 +133,17 @@ def _descended(problem: DiffractionProblem, theta: Theta, own: Own, rules: PsfRu
     return Approach(problem, end)
 
 
-def _with_bar(problem: DiffractionProblem, own: Own, rules: PsfRules) -> Approach:
+def _with_bar(problem: DiffractionProblem, without: Approach, own: Own, rules: PsfRules) -> Approach | None:
     """Begin at every place on both axes with some positions, and go on from the best with all.
 
-    A descent may begin slowly and end lowest. So after a few steps, several of the best go on to their ends.
+    A descent may begin slowly and end lowest. So after a few steps, several of the best go on to their ends. Where none
+    of them fits better than what is found ``without`` a bar, there is none.
     """
-    # Positions spread over the field; the first steps need no more.
+    # Positions spread over the field, and a coarser lattice; the first steps need no more.
     spread = np.unique(np.linspace(0, len(own) - 1, rules.bar_positions).round().astype(int))
-    few, enough = replace(problem, samples=problem.samples.at(spread)), 1e-3 * problem.used
+    coarse, samples = coarser(problem.evaluator.lattice), problem.samples.at(spread)
+    few = replace(problem, samples=samples, evaluator=replace(problem.evaluator, lattice=coarse))
+    few, enough = few.with_overlaps(problem.prior.mean), 1e-3 * problem.used
     begun = []
     for axis, part in product(range(2), rules.bar_places):
         prior = shaped_prior(problem.prior, rules, (axis, part * float(problem.prior.mean[OPENINGS][axis])))
@@ -151,6 +155,9 @@ def _with_bar(problem: DiffractionProblem, own: Own, rules: PsfRules) -> Approac
     rest = solver_rules(enough, rules.iterations)
     ends = [replace(one, end=minimise(one.problem, one.end.place, rest)) for one in begun[: rules.bar_ends]]
     best = min(ends, key=lambda one: one.end.equations.cost)
+    costs = [position.cost for position in without.problem.by_position(without.end.place)]
+    if best.end.equations.cost >= sum(costs[position] for position in spread):
+        return None
     return _descended(replace(problem, prior=best.problem.prior), best.end.place.theta, own, rules)
 
 

@@ -244,7 +244,9 @@ def _refine(
         change = solution.place.theta - place.theta
         moved = float(np.sqrt(change @ solution.equations.marginal()[0] @ change))
         LOG.debug("psf: model error %.3g, moved by %.3g sigma", model_error, moved)
-        fit = DiffractionFit(problem, solution, shots, model_error, found, iterations)
+        # Overlaps are large, and a fit that has ended does not need them.
+        ended = replace(problem, samples=problem.samples.without_overlaps())
+        fit = DiffractionFit(ended, solution, shots, model_error, found, iterations)
         # Derivatives are those of a place nearby: a descent may stop where they are not those of the cost, and the next
         # one goes on with new ones. Otherwise, and without iterations left, the round before counts: it has ended, with
         # weights of a slightly different model.
@@ -289,9 +291,10 @@ def without_outliers(samples: Samples, z: Light, rules: PsfRules) -> tuple[Sampl
 def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
     """Compare a fit with interference to the same fit without it, to second order about the fit."""
     problem, place, here = fit.problem, fit.solution.place, fit.solution.equations
-    samples, changes = problem.samples, ("overlaps", "correction", "by_overlaps")
+    samples, changes = problem.samples, ("correction", "by_overlaps")
     none = replace(samples, **{name: np.zeros_like(getattr(samples, name)) for name in changes})
-    change = place.light - replace(problem, samples=none).at(place.theta, place.own, place).light
+    averaged = replace(problem, samples=none, evaluator=replace(problem.evaluator, interference=False))
+    change = place.light - averaged.at(place.theta, place.own, place).light
     in_sigma = change * np.sqrt(samples.weight)
     score, alone = float((in_sigma * problem.errors(place)).sum()), float((in_sigma**2).sum())
     # Residuals change by so small a part of the phase's light that their outliers stay the same.
