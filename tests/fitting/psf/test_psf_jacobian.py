@@ -113,9 +113,9 @@ def test_light_on_the_fits_lattice_is_that_of_a_finer_one(scene: Scene, prior: P
 def light_errors(scene: Scene, prior: Prior, shots: Shots) -> list[float]:
     """Relative L2 error of samples' light on the fit's lattice, and on one of 4 nodes to a pixel."""
     problem, lit = problem_of(scene, prior, shots, True), []
-    one = problem.samples.at(0)
+    one, kept = problem.samples.at(0), problem.evaluator.lattice
+    rows, columns = kept.rows / kept.per_px_y, kept.columns / kept.per_px_x
     for per_px in (12, PER_PX, 4):
-        rows, columns = (1.25 * (2 * half + 9) for half in _HALF)
         evaluator = replace(problem.evaluator, lattice=lattice_for(rows, columns, per_px, per_px))
         overlaps = evaluator.overlaps(prior.mean, one.frame)
         kernel = np.asarray(evaluator.kernel(prior.mean, one.frame, one.disc_px, overlaps))

@@ -30,7 +30,6 @@ from udccal.fitting.psf.kernel import (
     Own,
     Samples,
     Theta,
-    coarser,
 )
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
 from udccal.numerics import in_two_threads
@@ -139,11 +138,9 @@ def _with_bar(problem: DiffractionProblem, without: Approach, own: Own, rules: P
     A descent may begin slowly and end lowest. So after a few steps, several of the best go on to their ends. Where none
     of them fits better than what is found ``without`` a bar, there is none.
     """
-    # Positions spread over the field, and a coarser lattice; the first steps need no more.
+    # Positions spread over the field; the first steps need no more.
     spread = np.unique(np.linspace(0, len(own) - 1, rules.bar_positions).round().astype(int))
-    coarse, samples = coarser(problem.evaluator.lattice), problem.samples.at(spread)
-    few = replace(problem, samples=samples, evaluator=replace(problem.evaluator, lattice=coarse))
-    few, enough = few.with_overlaps(problem.prior.mean), 1e-3 * problem.used
+    few, enough = replace(problem, samples=problem.samples.at(spread)), 1e-3 * problem.used
     begun = []
     for axis, part in product(range(2), rules.bar_places):
         prior = shaped_prior(problem.prior, rules, (axis, part * float(problem.prior.mean[OPENINGS][axis])))
@@ -156,7 +153,8 @@ def _with_bar(problem: DiffractionProblem, without: Approach, own: Own, rules: P
     ends = [replace(one, end=minimise(one.problem, one.end.place, rest)) for one in begun[: rules.bar_ends]]
     best = min(ends, key=lambda one: one.end.equations.cost)
     costs = [position.cost for position in without.problem.by_position(without.end.place)]
-    if best.end.equations.cost >= sum(costs[position] for position in spread):
+    of_data = best.end.equations.cost - best.problem.prior.cost(best.end.place.theta)
+    if of_data >= sum(costs[position] for position in spread):
         return None
     return _descended(replace(problem, prior=best.problem.prior), best.end.place.theta, own, rules)
 

@@ -55,8 +55,6 @@ WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 # Nodes of a fit's lattice to a pixel. The light of an LED whose image is a pixel wide errs by up to 0.3 %, and by up to
 # 0.9 % with 4. Derivatives need as many: with 4, small blurs ended 9 sigma beside the minimum.
 PER_PX: Final = 6
-# Enough to look for a bar. Descents that begin far from the minimum end elsewhere on it.
-_COARSE_PER_PX: Final = 4
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
 # in mm, the logarithm of the blur in px, bars of (columns, rows), logarithms of the corners' radius and of slants of
 # (columns, rows), and the footprint's place on columns and rows with its stand-off, in pitches.
@@ -254,12 +252,6 @@ def fit_lattice(half: tuple[int, int]) -> Lattice:
     """Return a fit's lattice, a quarter wider than the window, for sources off the middle."""
     rows, columns = (1.25 * (2 * h + 9) for h in half)
     return lattice_for(rows, columns, PER_PX, PER_PX)
-
-
-def coarser(lattice: Lattice) -> Lattice:
-    """Return the lattice of the same size on which a bar is looked for."""
-    rows, columns = lattice.rows / lattice.per_px_y, lattice.columns / lattice.per_px_x
-    return lattice_for(rows, columns, _COARSE_PER_PX, _COARSE_PER_PX)
 
 
 @final
