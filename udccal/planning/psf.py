@@ -19,8 +19,9 @@ from udccal.arrangements import Led
 from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.psf.data import PsfRules, Shots, held_out_positions
-from udccal.fitting.psf.kernel import Evaluator, Samples, fit_lattice, gather
+from udccal.fitting.psf.kernel import Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem
+from udccal.fitting.psf.samples import Samples, gather
 from udccal.fitting.psf.start import choose_samples, stands_for, start_model, start_prior
 from udccal.fitting.wire.parameters import ideal_wire, possible_harmonics, wire_start
 from udccal.numerics import in_float64

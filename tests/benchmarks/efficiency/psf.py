@@ -20,8 +20,9 @@ from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import Prior, cramer_rao, scaled_inverse
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import fit_diffraction
-from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, Samples, fit_lattice, gather
+from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, kernel_of
+from udccal.fitting.psf.samples import Samples, gather
 from udccal.fitting.psf.start import choose_samples, start_model, start_prior
 from udccal.numerics import in_float64
 from udccal.rig import load_rig

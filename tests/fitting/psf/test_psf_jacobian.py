@@ -22,10 +22,11 @@ from udccal.fitting.psf.kernel import (
     SLANT,
     WAVELENGTHS_NM,
     Evaluator,
+    Kernel,
     fit_lattice,
-    gather,
 )
 from udccal.fitting.psf.problem import DiffractionProblem, stepped
+from udccal.fitting.psf.samples import gather
 from udccal.fitting.psf.start import start_model, start_prior, wavelengths_nm
 from udccal.models.lattice import lattice_for, sample
 from udccal.numerics import in_float64
@@ -147,7 +148,7 @@ def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray
             # The kernel of the same numbers: what changes is the overlaps.
             overlaps = problem.evaluator.overlaps(other, one.frame)
             kernel = np.asarray(problem.evaluator.kernel(theta, one.frame, one.disc_px, overlaps))
-            lit.append(one.unit_light(kernel, own[0, :, :2]))
+            lit.append(one.unit_light(Kernel(problem.evaluator.lattice, kernel), own[0, :, :2]))
         wanted.append((lit[0] - lit[1]) / (2 * step_mm))
     return np.moveaxis(np.asarray(one.by_overlaps), -1, 0), np.stack(wanted)
 

@@ -15,7 +15,7 @@ from tests.scenes.psf import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.diffraction import pattern_p_value, without_outliers
-from udccal.fitting.psf.kernel import Samples
+from udccal.fitting.psf.samples import Samples
 from udccal.fitting.psf.start import choose_samples, cut_crop, shot_noise, stands_for
 from udccal.models.diffraction import LocalFrame
 

@@ -18,20 +18,9 @@ from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import PsfRules
-from udccal.fitting.psf.kernel import (
-    AXES,
-    BAR_PLACE,
-    BAR_WIDTH,
-    CORNER,
-    FOOTPRINT,
-    OPENINGS,
-    PUPIL,
-    SLANT,
-    Own,
-    Samples,
-    Theta,
-)
+from udccal.fitting.psf.kernel import AXES, BAR_PLACE, BAR_WIDTH, CORNER, FOOTPRINT, OPENINGS, PUPIL, SLANT, Theta
 from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, start_own
+from udccal.fitting.psf.samples import Own, Samples
 from udccal.numerics import in_two_threads
 
 # Parameters that a bar has, and that corners and slants have.

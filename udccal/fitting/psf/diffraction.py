@@ -26,18 +26,9 @@ from udccal.fitting.psf.approach import (
     with_place_held,
 )
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
-from udccal.fitting.psf.kernel import (
-    BAR_WIDTH,
-    FOOTPRINT,
-    Evaluator,
-    Light,
-    Own,
-    Samples,
-    Theta,
-    fit_lattice,
-    gather,
-)
+from udccal.fitting.psf.kernel import BAR_WIDTH, FOOTPRINT, Evaluator, Theta, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place
+from udccal.fitting.psf.samples import Light, Own, Samples, gather
 from udccal.fitting.psf.start import choose_samples, stands_for
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry

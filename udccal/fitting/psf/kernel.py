@@ -1,26 +1,23 @@
-"""The kernel about a field position, on its lattice, its Jacobian by the parameters of diffraction, and samples of it.
+"""The kernel about a field position, on its lattice, and its Jacobian by the parameters of diffraction.
 
 A transfer function is a sum of products of slits along columns, slits along rows, overlaps of the pupil and strengths
 of the interference terms. It is linear in each factor: a derivative is the same product with one factor replaced by its
 derivative, and only factors are differentiated. It is also linear in the spectra: one evaluation per wavelength node
 serves all colours and all their derivatives.
-
-Own parameters of a shot are (x, y) in px from the first assumed place, light per colour and background in e-/s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, Final, final
+from dataclasses import dataclass
+from typing import Final, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from udccal.fitting.psf.data import Shots, left_out, noise_at
 from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import (
     Diffraction,
@@ -28,7 +25,6 @@ from udccal.models.diffraction import (
     average_transfer,
     blur_variance,
     lattice_frequencies,
-    local_frame,
     opening_overlaps,
     pupil_anchors,
     pupil_overlaps,
@@ -36,7 +32,6 @@ from udccal.models.diffraction import (
     slits_along,
     slits_of,
 )
-from udccal.models.geometry import Geometry
 from udccal.models.interference import (
     COLUMN_OF,
     HIGHEST_ORDER,
@@ -48,7 +43,6 @@ from udccal.models.interference import (
     strengths,
 )
 from udccal.models.lattice import Lattice, lattice_for, sample, spline_coefficients
-from udccal.models.psf import lattice_points
 from udccal.models.slits import Slits
 
 WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
@@ -62,19 +56,27 @@ HEAD: Final = 21
 PITCH, PUPIL, BLUR, GROWTH, BLUR_RED, BLUR_BLUE, DEPTH_RATIO = 0, 4, 5, slice(6, 8), 8, 9, 10
 OPENINGS, BAR_WIDTH, BAR_PLACE, CORNER = slice(1, 3), slice(11, 13), slice(13, 15), 15
 SLANT, FOOTPRINT = slice(16, 18), slice(18, 21)
-OWN: Final = 6
 # What pairs of (columns, rows) are of.
 AXES: Final = ("columns", "rows")
-_PER_SAMPLE = ("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps")
-# Parameters of diffraction; own parameters and light of the shots, of one position or of all.
+# Parameters of diffraction.
 Theta = Float[np.ndarray, " p"]
-Own = Float[np.ndarray, "*positions shots l"]
-Light = Float[np.ndarray, "*positions shots n"]
-# Spline coefficients of a kernel about its position.
-Kernel = Float[np.ndarray, "y x 3"]
 Overlaps = Float[Arrayish, "nodes terms rows half"]
 # Tables of slits of columns and of rows.
 Tables = tuple[Array, Array]
+
+
+@final
+@dataclass(frozen=True)
+class Kernel:
+    """A picture about a position for each colour, or each of some channels: its spline coefficients."""
+
+    lattice: Lattice
+    coefficients: Float[np.ndarray, "y x channels"]
+
+    def at(self, points_px: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points channels"]:
+        """Return the density per square px at places (x, y) from the position."""
+        values = sample(self.lattice, self.coefficients, points_px.reshape(-1, 2))
+        return np.asarray(values.reshape(*points_px.shape[:-1], -1))
 
 
 @final
@@ -252,159 +254,3 @@ def fit_lattice(half: tuple[int, int]) -> Lattice:
     """Return a fit's lattice, a quarter wider than the window, for sources off the middle."""
     rows, columns = (1.25 * (2 * h + 9) for h in half)
     return lattice_for(rows, columns, PER_PX, PER_PX)
-
-
-@final
-class Samples(eqx.Module):
-    """The chosen samples of all shots, by field position (no such axis for one position); padding has weights of 0.
-
-    Attributes:
-        points, density: samples on the lattice about the mean place; see ``models.psf.lattice_points``.
-        slope: lattice units per pixel, to move a source.
-        begun_px: (x, y) of the shots from the mean place, as first assumed.
-        colour: each sample's colour (one-hot).
-        known: inverse variance of a sample as measured, 0 where there is no sample.
-        noise_per_rate: derivative of that variance by the light, in (e-/s)^2 per e-/s.
-        weight: inverse variance that the fit uses.
-        correction: light per unit that a shot has in addition because the pupil's footprint lies elsewhere on the rows
-            than at the mean place.
-        by_overlaps: derivative of interference by pitch and pupil through overlaps, per mm and unit of light.
-        overlaps, overlaps_at: see ``Evaluator.overlaps``, empty before they are set; pitch and pupil (mm) there.
-        index: of the shots, -1 for padding.
-    """
-
-    frame: LocalFrame
-    points: Float[np.ndarray, "*positions shots n 2"]
-    density: Float[np.ndarray, "*positions shots n"]
-    slope: Float[np.ndarray, "*positions 2 2"]
-    begun_px: Float[np.ndarray, "*positions shots 2"]
-    colour: Float[np.ndarray, "*positions shots n 3"]
-    rate: Float[np.ndarray, "*positions shots n"]
-    known: Float[np.ndarray, "*positions shots n"]
-    noise_per_rate: Float[np.ndarray, "*positions shots n"]
-    weight: Float[np.ndarray, "*positions shots n"]
-    correction: Float[np.ndarray, "*positions shots n"]
-    by_overlaps: Float[np.ndarray, "*positions shots n 2"]
-    overlaps_at: Float[np.ndarray, "*positions 2"]
-    overlaps: Float[np.ndarray, "*positions nodes terms rows half"]
-    disc_px: Float[Arrayish, "*positions"]
-    index: Int[np.ndarray, "*positions shots"]
-
-    def at(self, which: int | slice | Int[np.ndarray, " some"]) -> Samples:
-        """Return the samples of one position, or of several."""
-        return jax.tree.map(lambda part: part[which], self)
-
-    def each(self) -> list[Samples]:
-        """Return the samples of every position."""
-        return [self.at(position) for position in range(len(self.index))]
-
-    def without_overlaps(self) -> Samples:
-        """Return the samples with overlaps empty, as before they are set."""
-        return replace(self, overlaps=np.zeros((len(self.index), 0, 0, 0, 0), dtype=np.float32))
-
-    def nearest(self, count: int) -> Samples:
-        """Return so many samples of every shot, of one position: those next to the mean place."""
-        order = np.argsort((self.points**2).sum(axis=-1), axis=-1, kind="stable")
-        chosen = np.arange(len(order))[:, None], order[:, :count]
-        return replace(self, **{name: getattr(self, name)[chosen] for name in _PER_SAMPLE})
-
-    def sensor_variance(self, level: Float[np.ndarray, "*k n"]) -> Float[np.ndarray, "*k n"]:
-        """Return the variance of the samples' noise if their true rate is ``level``; 1 where there is no sample."""
-        measured = 1.0 / np.where(self.known > 0, self.known, 1.0)
-        return noise_at(level, self.rate, measured, self.noise_per_rate * (self.known > 0))
-
-    def weighed(
-        self, model_error: float, light: np.ndarray | None = None, background: np.ndarray | float = 0.0
-    ) -> Samples:
-        """Return the samples with weights at the expected ``light`` and ``background`` (e-/s), or at the data."""
-        seen, light = self.known > 0, self.rate if light is None else light
-        variance = self.sensor_variance(light + background) + left_out(light * seen, model_error) ** 2
-        return replace(self, weight=np.where(seen, 1.0 / variance, 0.0))
-
-    def flux(self, own: Float[np.ndarray, "*k l"]) -> Float[np.ndarray, "*k n"]:
-        """Return the LED's light in each sample's own colour, in e-/s."""
-        return np.einsum("...snc,...sc->...sn", self.colour, own[..., 2:5])
-
-    def sampled(
-        self, coefficients: Float[np.ndarray, "y x c"], offset_px: Float[np.ndarray, "*moves 2"]
-    ) -> Float[np.ndarray, "*moves n c"]:
-        """Return each sample's light per unit of the LED's light at one position, for every kernel of the coefficients.
-
-        The LEDs' offsets from the mean place are of ``shots``, or of any number of moves x shots.
-        """
-        points = self.points - (offset_px @ self.slope.T)[..., None, :]
-        lattice = Lattice(coefficients.shape[0], coefficients.shape[1], PER_PX, PER_PX)
-        values = sample(lattice, coefficients, points.reshape(-1, 2)).reshape(*points.shape[:-1], -1)
-        return np.asarray(values * self.density[..., None])
-
-    def unit_light(self, kernel: Kernel, offset_px: Float[np.ndarray, "*moves 2"]) -> Float[np.ndarray, "*moves n"]:
-        """Return each sample's light per unit of light of its own colour, at one position and without corrections."""
-        return np.einsum("...snc,snc->...sn", self.sampled(kernel, offset_px), self.colour)
-
-    def own_slopes(
-        self, own: Own, kernel: Kernel, here: Light, changed: Light | float = 0.0
-    ) -> Float[np.ndarray, "shots n l"]:
-        """Return derivatives of one position's light by each shot's own parameters.
-
-        ``here`` is the light per unit by the ``kernel`` at the shots' places; ``changed`` is what is added to it.
-        """
-        # Differences over a 160th of the lattice's spacing: a cubic spline has no more detail.
-        step, flux, unit = 1e-3, self.flux(own)[..., None], here + changed
-        ahead = [self.unit_light(kernel, own[:, :2] + step * move) for move in np.eye(2)]
-        by_move = (np.stack(ahead, axis=-1) - here[..., None]) / step
-        return np.concatenate([flux * by_move, unit[..., None] * self.colour, np.ones_like(flux)], axis=-1)
-
-
-@eqx.filter_jit
-def _block(geometry: Geometry, place: Float[Arrayish, "2"], offsets_px: Float[Arrayish, "m 2"]) -> tuple[Any, ...]:
-    frame = local_frame(geometry, place)
-    return frame, *lattice_points(geometry, frame, place, jnp.asarray(offsets_px))
-
-
-def _on_lattice(
-    geometry: Geometry, place: Float[np.ndarray, "2"], offsets_px: Float[np.ndarray, "m 2"]
-) -> tuple[LocalFrame, Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Return a place's frame and pixels near it on its lattice, in blocks of one size that share a compilation."""
-    count, size = len(offsets_px), 2048
-    blocks = np.pad(offsets_px, ((0, -count % size), (0, 0))).reshape(-1, size, 2)
-    made = [jax.tree.map(np.asarray, _block(geometry, place, block)) for block in blocks]
-    points, density = (np.concatenate([one[part] for one in made])[:count] for part in (1, 2))
-    return made[0][0], points, density
-
-
-def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots rows columns"]) -> Samples:
-    """Arrange the chosen samples by field position, without overlaps; there are as many in every shot."""
-    groups = [np.flatnonzero(shots.position == g) for g in range(shots.positions)]
-    most, places = max(len(group) for group in groups), shots.positions_px()
-    index = np.stack([np.pad(group, (0, most - len(group)), constant_values=-1) for group in groups])
-    # Padding has the place and the light of a position's first shot, but no weight.
-    group, real = np.where(index < 0, index[:, :1], index), (index >= 0)[..., None]
-
-    def taken(values: np.ndarray) -> np.ndarray:
-        return values[chosen].reshape(shots.count, -1, *values.shape[3:])[group]
-
-    offsets = np.broadcast_to(shots.offsets(), (*shots.rate.shape, 2))
-    away = taken(offsets) + (shots.origin_px[group] - places[:, None])[:, :, None]
-    begun, size, weight = shots.centre_px[group] - places[:, None], away.shape[:3], taken(shots.weight) * real
-    together = np.concatenate([away.reshape(len(groups), -1, 2), begun], axis=1)
-    made = [_on_lattice(geometry, place, offset) for place, offset in zip(places, together, strict=True)]
-    frame, points, density = jax.tree.map(lambda *parts: np.stack(parts), *made)
-    scale = np.abs(np.diagonal(frame.jacobian, axis1=1, axis2=2))
-    return Samples(
-        frame=frame,
-        points=points[:, :-most].reshape(*size, 2) - points[:, -most:, None],
-        density=density[:, :-most].reshape(size),
-        slope=frame.jacobian / scale[..., None],
-        begun_px=begun,
-        colour=taken(shots.colour) * real[..., None],
-        rate=taken(shots.rate).astype(np.float64),
-        known=weight,
-        noise_per_rate=taken(shots.noise_per_rate),
-        weight=weight,
-        correction=np.zeros(size),
-        by_overlaps=np.zeros((*size, 2)),
-        overlaps_at=np.zeros((len(groups), 2)),
-        overlaps=np.zeros((len(groups), 0, 0, 0, 0), dtype=np.float32),
-        disc_px=np.array([shots.disc_px[group].mean() for group in groups]),
-        index=index,
-    )

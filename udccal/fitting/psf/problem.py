@@ -22,19 +22,15 @@ from udccal.fitting.psf.kernel import (
     CORNER,
     FOOTPRINT,
     HEAD,
-    OWN,
     PITCH,
     PUPIL,
     SLANT,
     Evaluator,
     Kernel,
-    Light,
-    Own,
-    Samples,
     Theta,
     fit_lattice,
-    gather,
 )
+from udccal.fitting.psf.samples import OWN, Light, Own, Samples, gather
 from udccal.models.geometry import Geometry
 from udccal.models.interference import TERMS
 from udccal.numerics import in_two_threads
@@ -245,8 +241,8 @@ def _huber_weight(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def kernel_of(evaluator: Evaluator, theta: Float[np.ndarray, " p"], one: Samples) -> Kernel:
-    """Return the kernel's spline coefficients at one position."""
-    return np.asarray(evaluator.kernel(theta, one.frame, one.disc_px, one.overlaps))
+    """Return the kernel at one position."""
+    return Kernel(evaluator.lattice, np.asarray(evaluator.kernel(theta, one.frame, one.disc_px, one.overlaps)))
 
 
 def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float[np.ndarray, "shots n p"]:
@@ -254,9 +250,10 @@ def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float
     spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
     # Single precision takes less time, and its errors are a millionth of a derivative.
     with jax.enable_x64(False):
-        made = evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps)
-        coefficients, chain = (np.asarray(part) for part in made)
-    nodes, by_factor = np.split(one.sampled(coefficients, own[:, :2]), [spectra.shape[1]], axis=-1)
+        by_channel = evaluator.jacobian(theta, one.frame, one.disc_px, one.overlaps)
+        coefficients, chain = (np.asarray(part) for part in by_channel)
+    made = one.sampled(Kernel(evaluator.lattice, coefficients), own[:, :2])
+    nodes, by_factor = np.split(made, [spectra.shape[1]], axis=-1)
     of_colour = one.colour @ spectra
     unit = np.einsum("snj,snj->sn", nodes, of_colour)
     of_own = by_factor.reshape(*unit.shape, -1, 3) * one.colour[:, :, None]
@@ -282,7 +279,7 @@ def _set_up(
     correction = np.zeros_like(here)
     for shot, change in enumerate(along):
         more = np.asarray(evaluator.moved(theta, one.frame, one.disc_px, one.overlaps, change))
-        correction[shot] = one.unit_light(more, offset_px)[shot]
+        correction[shot] = one.unit_light(Kernel(evaluator.lattice, more), offset_px)[shot]
     one = replace(one, overlaps_at=theta[_IN_OVERLAPS], correction=correction)
     if near:
         return one
