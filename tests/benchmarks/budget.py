@@ -106,7 +106,7 @@ class Filter:
             for site in self.pattern.sites:
                 channels[site.samples] = site.channel
             tiles = np.take_along_axis(tiles, channels[None, None], axis=1)[:, 0]
-        given = self.tables, self.layout, self.pattern, _WORKERS
+        given = self.tables, self.layout, self.pattern
         picture, strengths = filtered_and_joined(tiles, noise_e, *given)
         local = cv2.blur(variance.mean(axis=2), (16, 16))
         bands = self.noise.of_tiles(strengths)

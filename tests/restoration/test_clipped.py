@@ -52,7 +52,7 @@ def solved(whole: np.ndarray, clipped: np.ndarray) -> tuple[np.ndarray, np.ndarr
     _, layout, tables = prepared()
     noise = np.full((layout.count, 3), NOISE_E, np.float32)
     tiles, missing = layout.cut(whole), layout.cut(clipped.astype(np.float32)) > 0
-    given = noise, tables, layout, CFA, 1
+    given = noise, tables, layout, CFA
     before, _ = filtered(tiles, *given)
     filled = np.stack(
         [

@@ -38,7 +38,7 @@ def test_lost_detail_is_that_of_draws() -> None:
         for mosaic, kept in ((np.take_along_axis(blurred, channels[None], 0)[0] + noise, wrong), (noise, noise_alone)):
             tile = mosaic.astype(np.float32)[None]
             unit = np.ones((1, 3), np.float32)
-            found, _ = filtered(tile, unit, one, layout, cfa, 1, np.array([strength], np.float32))
+            found, _ = filtered(tile, unit, one, layout, cfa, np.array([strength], np.float32))
             truth = np.moveaxis(scene, 0, -1) if kept is wrong else 0.0
             kept.append(np.mean((found[0] - truth)[inner] ** 2, axis=(0, 1)))
     noise_variance, lost = np.mean(noise_alone, axis=0), expected.variance[0, INDEX]

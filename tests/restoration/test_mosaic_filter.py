@@ -62,7 +62,7 @@ def test_the_filter_is_the_posteriors_mean(name: str, monkeypatch: pytest.Monkey
     layout = TileLayout(SIZE, SIZE, 0, SIZE, SIZE, SIZE, cfa.rows, cfa.columns)
     monkeypatch.setattr(TileLayout, "taper", np.ones((SIZE, SIZE), np.float32))
     unit, given = np.ones((1, 3), np.float32), np.array([strength], np.float32)
-    found, chosen = filtered(tile[None], unit, tables, layout, cfa, 1, given)
+    found, chosen = filtered(tile[None], unit, tables, layout, cfa, given)
     expected = dense_solution(tile.astype(float), kernel, cfa, strength)
     assert float(chosen[0]) == strength
     # In sigma of a sample's noise: single precision costs most at the tile's mean, where the prior is widest.
@@ -93,8 +93,8 @@ def test_scenes_drawn_from_the_prior_choose_their_own_strength(strength: float) 
     own = cfa.channel_map(*shape)
     mosaics = np.take_along_axis(scene, own[None, None], axis=1)[:, 0] + rng.normal(size=(layout.count, *shape))
     noise = np.ones((layout.count, 3), np.float32)
-    _, chosen = filtered(mosaics.astype(np.float32), noise, tables, layout, cfa, 1)
+    _, chosen = filtered(mosaics.astype(np.float32), noise, tables, layout, cfa)
     assert np.all(np.abs(np.log2(chosen / strength)) <= 1.01)
     # Twice the signal and twice the noise is the same tile.
-    _, again = filtered(2 * mosaics.astype(np.float32), 2 * noise, tables, layout, cfa, 1)
+    _, again = filtered(2 * mosaics.astype(np.float32), 2 * noise, tables, layout, cfa)
     np.testing.assert_array_equal(chosen, again)

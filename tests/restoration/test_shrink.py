@@ -35,7 +35,7 @@ def restored(
     """A mosaic after the filter, and after its noise is taken out."""
     strengths = np.full(layout.count, strength, np.float32)
     sigma = np.full((layout.count, 3), sigma_e, np.float32)
-    pictures, _ = filtered(layout.cut(mosaic), sigma, tables, layout, CFA, 1, strengths)
+    pictures, _ = filtered(layout.cut(mosaic), sigma, tables, layout, CFA, strengths)
     joined = layout.join(pictures)
     variance = np.full(mosaic.shape, sigma_e**2, np.float32)
     return joined, shrunk(joined, sigma, variance, noise.of_tiles(strengths), layout, 1)

@@ -87,7 +87,7 @@ def deblur(
     read, slope = _noise_line(tiles, _finest(rows, columns))
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), _LEAST_VARIANCE)).astype(np.float32)
     tables = colour_tables(grid, layout, workers)
-    given = noise, tables, layout, THREE_COLOURS, workers
+    given = noise, tables, layout, THREE_COLOURS
     chosen, strengths = filtered_and_joined(tiles, *given)
     if tier is Tier.fast:
         return chosen * np.float32(unit)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -154,16 +153,13 @@ def _measured(options: PlanOptions) -> PartTimes:
         variance /= ones
         clean -= np.float32(1.0) * ones
 
-    given = unit, tables, layout, cfa, workers
+    given = unit, tables, layout, cfa
     tiles = layout.cut(signal)
     clipped = rng.random(tiles.shape[1:]) < _CLIPPED
 
     def completion(effort: Effort) -> None:
-        def one(index: int) -> None:
+        for index in range(layout.count):
             completed(tiles[index], clipped, unit[index], tables.at(int(layout.kernel[index])), layout, cfa, effort)
-
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(one, range(layout.count)))
 
     def network() -> None:
         planes = noise_planes(bands, unit, signal, layout)

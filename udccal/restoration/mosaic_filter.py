@@ -17,8 +17,7 @@ Samples come in units of their noise. Then one table serves every brightness, ex
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import cv2
@@ -88,10 +87,11 @@ def filtered(
     tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
-    workers: int,
     strengths: Float32[np.ndarray, "tiles"] | None = None,
 ) -> tuple[Float32[np.ndarray, "tiles rows columns 3"], Float32[np.ndarray, " tiles"]]:
     """Demosaic and deblur tiles.
+
+    They follow each other on one core: two threads would wait for the interpreter so often that they take as long.
 
     Args:
         tiles: signal in e-, backscatter subtracted; with an axis of colours where the pattern's sites share a place.
@@ -99,15 +99,16 @@ def filtered(
         tables: of each tile's kernel.
         layout: of the tiles.
         pattern: the colour pattern.
-        workers: threads.
         strengths: of each tile's prior; None to choose the likeliest.
 
     Returns:
         pictures in e-, and the strength of the prior that each tile chose, in units of its noise.
     """
     pictures = np.empty((len(tiles), layout.rows, layout.columns, 3), dtype=np.float32)
-    given = tiles, noise_e, tables.at, layout, pattern, workers, strengths
-    return pictures, _filter_each(*given, [range(len(tiles))], pictures.__setitem__)
+    chosen = np.empty(len(tiles), dtype=np.float32)
+    for index, made in enumerate(_filter_each(tiles, noise_e, tables.at, layout, pattern, strengths)):
+        pictures[index], chosen[index] = made
+    return pictures, chosen
 
 
 def filtered_and_joined(
@@ -116,17 +117,19 @@ def filtered_and_joined(
     tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
-    workers: int,
     strengths: Float32[np.ndarray, "tiles"] | None = None,
 ) -> tuple[Float32[np.ndarray, "covered_rows frame_columns 3"], Float32[np.ndarray, " tiles"]]:
     """Demosaic and deblur all tiles of a layout, and blend their pictures into one.
 
-    Every picture is blended while a core's cache has it. Arguments and strengths are those of ``filtered``, but that
+    Every picture is blended while the core's cache has it. Arguments and strengths are those of ``filtered``, but that
     ``tables`` are those of the layout's kernels.
     """
-    joined = np.zeros((*layout.covered, 3), dtype=np.float32)
-    given = tiles, noise_e, lambda index: tables.at(int(layout.kernel[index])), layout, pattern, workers, strengths
-    return joined, _filter_each(*given, layout.apart, lambda index, picture: layout.blend(picture, index, joined))
+    joined, chosen = np.zeros((*layout.covered, 3), dtype=np.float32), np.empty(len(tiles), dtype=np.float32)
+    given = tiles, noise_e, lambda index: tables.at(int(layout.kernel[index])), layout, pattern, strengths
+    for index, (picture, strength) in enumerate(_filter_each(*given)):
+        layout.blend(picture, index, joined)
+        chosen[index] = strength
+    return joined, chosen
 
 
 def likeliest_strength(
@@ -147,23 +150,12 @@ def _filter_each(
     tables_of: Callable[[int], Tables],
     layout: TileLayout,
     pattern: Pattern,
-    workers: int,
-    strengths: Float32[np.ndarray, "tiles"] | None,
-    groups: Iterable[Sequence[int]],
-    take: Callable[[int, Float32[np.ndarray, "rows columns 3"]], None],
-) -> Float32[np.ndarray, " tiles"]:
-    """Filter one group of tiles after the other, hand over every picture, and return the strengths."""
-    chosen = np.empty(len(tiles), dtype=np.float32)
-
-    def one(index: int) -> None:
-        own = noise_e[index], tables_of(index), layout, pattern, None if strengths is None else strengths[index]
-        picture, chosen[index] = _filtered_tile(tiles[index], *own)
-        take(index, picture)
-
-    with ThreadPoolExecutor(workers) as pool:
-        for group in groups:
-            list(pool.map(one, group))
-    return chosen
+    strengths: Float32[np.ndarray, " tiles"] | None,
+) -> Iterator[tuple[Float32[np.ndarray, "rows columns 3"], np.float32]]:
+    """Filter one tile after the other: their pictures and strengths."""
+    for index, tile in enumerate(tiles):
+        given = None if strengths is None else strengths[index]
+        yield _filtered_tile(tile, noise_e[index], tables_of(index), layout, pattern, given)
 
 
 def _filtered_tile(

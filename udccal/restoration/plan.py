@@ -44,7 +44,7 @@ class PlanOptions:
             frame share a kernel.
         interpolation: with which sharp pictures are resampled onto the view.
         network_views: ways round in which the network of the tier ``accurate`` sees the picture, 1 to 4.
-        workers: threads of the Fourier transforms.
+        workers: threads where they save time.
 
     Raises:
         RestorationError: when one is no whole number that it may be, or no ``Interpolation``.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -140,24 +139,17 @@ class Sharpener:
         return best + self._contradicted(best, signal_e, clipped, found.noise_e)
 
     @property
-    def _given(self) -> tuple[FilterTables, TileLayout, Cfa, int]:
-        return self.tables, self.layout, self.cfa, self.options.workers
+    def _given(self) -> tuple[FilterTables, TileLayout, Cfa]:
+        return self.tables, self.layout, self.cfa
 
     def solved(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Solved:
         """Demosaic and deblur as ``apply`` does, but take out no noise."""
         noise_e = self._tile_noise(variance_e2)
         tiles = self.layout.tiles(signal_e)
-        at, missing = clipped_tiles(clipped, self.layout)
-        if len(at):
-            effort = effort_of(self.tier)
-
-            def whole(index: int, own: Clipped) -> Mosaic:
-                given = noise_e[index], self.tables.at(int(self.layout.kernel[index])), self.layout, self.cfa, effort
-                return completed(tiles[index], own, *given)
-
-            with ThreadPoolExecutor(self.options.workers) as pool:
-                for index, tile in zip(at, pool.map(whole, at.tolist(), missing), strict=True):
-                    tiles[index] = tile
+        for index, missing in zip(*clipped_tiles(clipped, self.layout), strict=True):
+            tables, effort = self.tables.at(int(self.layout.kernel[index])), effort_of(self.tier)
+            given = noise_e[index], tables, self.layout, self.cfa, effort
+            tiles[index] = completed(tiles[index], missing, *given)
         return Solved(tiles, *filtered_and_joined(tiles, noise_e, *self._given), noise_e)
 
     def _sharper(self, found: Solved) -> Strip:

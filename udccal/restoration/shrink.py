@@ -87,7 +87,7 @@ def measured_noise(
     tiles = np.repeat(noise, len(strengths), axis=0)
     unit = np.ones((len(tiles), 3), dtype=np.float32)
     own, repeated_strengths = tables.at(layout.kernel[repeated]), np.tile(strengths, len(chosen))
-    pictures, _ = filtered(tiles, unit, own, layout, pattern, workers, repeated_strengths)
+    pictures, _ = filtered(tiles, unit, own, layout, pattern, repeated_strengths)
     whole = tuple(slice(ends.both, -ends.both) for ends in (layout.down, layout.across))
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda picture: _band_variances(picture[whole]), pictures))

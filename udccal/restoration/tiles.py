@@ -215,12 +215,6 @@ class TileLayout:
         rows = _mirrored(self.tops, self.rows, self.frame_rows, self.cell_rows) - self.reach.start
         return rows, _mirrored(self.lefts, self.columns, self.frame_columns, self.cell_columns)
 
-    @functools.cached_property
-    def apart(self) -> list[list[int]]:
-        """Numbers of the tiles in four groups. Tiles of a group do not touch: threads may blend them at once."""
-        at = self.by_place(np.arange(self.count))
-        return [at[down::2, across::2].ravel().tolist() for down in (0, 1) for across in (0, 1)]
-
     def blend(
         self,
         picture: Float32[np.ndarray, "rows columns 3"],
@@ -238,8 +232,8 @@ class TileLayout:
     ) -> Float32[np.ndarray, "covered_rows frame_columns 3"]:
         """Blend the tiles' pictures into one of the rows that are covered."""
         joined = np.zeros((*self.covered, 3), dtype=np.float32)
-        for index in itertools.chain(*self.apart):
-            self.blend(pictures[index], index, joined)
+        for index, picture in enumerate(pictures):
+            self.blend(picture, index, joined)
         return joined
 
     @property

@@ -133,7 +133,7 @@ class Examples:
         most_e = float(white.max() * rng.uniform(1.0, 1.4)) if lit else np.inf
         tile, variance = _samples(scene, optics, panel, rng.uniform(1.0, 6.0), most_e, rng)
         noise_e = np.sqrt(variance.mean(axis=(1, 2)))[None]
-        given = optics.tables, optics.layout, optics.pattern, 1
+        given = optics.tables, optics.layout, optics.pattern
         if lit:
             tile = _clipped(tile, most_e, noise_e, given)
         chosen, strength = filtered_and_joined(tile[None], noise_e, *given)

@@ -119,7 +119,7 @@ def _of_tiles(restorer: Restorer, taken: Taken) -> Growth:
     def of(count: int) -> Callable[[], object]:
         some = np.arange(count)
         given = tiles[some], noise_e[some], sharpener.tables.at(sharpener.layout.kernel[some])
-        return lambda: filtered(*given, sharpener.layout, sharpener.cfa, restorer.options.workers)
+        return lambda: filtered(*given, sharpener.layout, sharpener.cfa)
 
     return Growth("filter against tiles", tuple(counts), tuple(_least_cpu_s(of(count)) for count in counts))
 
