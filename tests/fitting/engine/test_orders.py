@@ -75,7 +75,9 @@ def test_the_sigma_of_a_quantity_holds_that_the_choice_may_be_wrong(true: float)
 
 
 def test_the_root_of_a_variance_that_is_lost_in_its_error_is_as_uncertain_as_that() -> None:
-    assert Quantity(4.0, 0.01).root() == (2.0, 0.25)
+    assert Quantity(400.0, 0.01).root() == (20.0, pytest.approx(0.025, rel=1e-3))
+    # Three sigma lower, the variance is 1, and the root 1 lower.
+    assert Quantity(4.0, 1.0).root() == (2.0, pytest.approx(1 / 3))
     value, slope = Quantity(0.0, 1e-4).root()
     assert (value, slope * 1e-2) == (0.0, pytest.approx(0.1))
 

@@ -414,3 +414,28 @@ def test_a_bracket_of_which_most_frames_are_left_out_is_in_doubt() -> None:
     merged = merged_light(np.ones(5), moved=True)
     assert merged.status is FitStatus.POOR_FIT
     assert any("few that agree are left" in note for note in merged.notes)
+
+
+def test_a_wrong_time_of_a_frame_that_clips_nearly_everywhere_is_told() -> None:
+    # Few pixels are as dark as a tenth of a full one, and dark current alone nearly fills them in the last frame.
+    noise = replace(NOISE, K_DN_per_e=3.41, black_DN=20.0, saturation_DN=1023.0, sigma_d_e=0.4)
+    rates, times = np.geomspace(2.8, 2.8e5, 12_000), 7.5e-4 * 2.9 ** np.arange(10)
+    for wrong, status in ((1.0, FitStatus.CONVERGED), (0.75, FitStatus.POOR_FIT), (1.27, FitStatus.POOR_FIT)):
+        rng = np.random.default_rng(6)
+        light = rng.poisson((rates + 20.0) * times[:, None]) + 0.4 * rng.standard_normal((10, 12_000))
+        frames = np.clip(np.rint(20.0 + 3.41 * light), 0, 1023).astype(np.uint16)
+        merge = merge_bracket(frames, np.where(np.arange(10) == 9, wrong, 1.0) * times, noise)
+        assert merge.status is status
+        assert any("light of frame 9 differs" in note for note in merge.notes) is (wrong != 1.0)
+
+
+def test_a_gain_that_is_too_large_by_a_tenth_is_told_of_few_pixels() -> None:
+    # Samples scatter less than with the right gain; no more than 300 electrons, of which few pixels have two samples.
+    noise = replace(NOISE, K_DN_per_e=13.65, black_DN=160.0, saturation_DN=4095.0, sigma_d_e=0.33)
+    rates, times = np.geomspace(1.0, 1e5, 5000), 1.4e-3 * 5.5 ** np.arange(6)
+    rng = np.random.default_rng(7)
+    light = rng.poisson((rates + 20.0) * times[:, None]) + 0.33 * rng.standard_normal((6, 5000))
+    frames = np.clip(np.rint(160.0 + 13.65 * light), 0, 4095).astype(np.uint16)
+    assert merge_bracket(frames, times, noise).status is FitStatus.CONVERGED
+    wrong = merge_bracket(frames, times, replace(noise, K_DN_per_e=1.11 * 13.65))
+    assert wrong.status is FitStatus.POOR_FIT

@@ -234,7 +234,7 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     dark = 64 + 0.3 * rng.standard_normal((100, 100))
     dark[3, 4] = dark[50, 60] = 90.0
     none = LineNoise(Quantity(0.0, 0.0, False), 99.0, False)
-    assert dsnu(dark, Quantity(0.09, 0.0), none, none, 1, RULES.defect_sigma, 1).places == ((3, 4), (50, 60))
+    assert dsnu(dark, Quantity(0.09, 0.0), none, none, 1, RULES.defect_sigma, 1, False).places == ((3, 4), (50, 60))
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
     counts = np.bincount(frame.ravel())
     assert codes.converter_step(counts) == 1

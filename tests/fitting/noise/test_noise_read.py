@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -10,11 +11,13 @@ import pytest
 
 from tests.scenes.noise import PLAIN, ToySensor, errors_in_sigma, measure
 from udccal.errors import FitError
+from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.dark import unexplained_variance
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, NoiseRules
 from udccal.fitting.noise.fit import fit_noise
-from udccal.fitting.noise.line_noise import column_noise
+from udccal.fitting.noise.line_noise import LineNoise, column_noise
 from udccal.fitting.noise.moments import reduced
+from udccal.fitting.noise.patterns import dsnu
 from udccal.result import FitResult, FitStatus
 
 SENSOR = ToySensor(rows=192, columns=256, lambda_read=None, row_DN=0.0, bend=0.0, DSNU_e=1.0)
@@ -167,3 +170,37 @@ def test_dark_current_bends_as_light_does() -> None:
     for name, truth in (("black_DN", 64.0), ("dark_current_e_per_s", 600.0)):
         value, sigma = estimate(result, name)
         assert abs(value - truth) < 4.5 * sigma
+
+
+def student(freedom: float) -> Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]:
+    return lambda rng, size: rng.standard_t(freedom, size) / np.sqrt(freedom / (freedom - 2))
+
+
+@pytest.mark.parametrize(
+    ("freedom", "K", "read_e", "bits", "black_DN"),
+    [(3.7, 0.45, 1.5, 10, 30.0), (3.0, 4.2, 2.3, 16, 1000.0), (3.0, 4.2, 2.3, 16, 64.0)],
+)
+def test_read_noise_whose_tails_hold_much_of_its_variance_is_within_sigma(
+    freedom: float, K: float, read_e: float, bits: int, black_DN: float
+) -> None:
+    """Tails look like hits, are missing by chance more often than not, and code 0 may cut them off."""
+    well = 0.8 * (2**bits - black_DN) / K
+    heavy = replace(
+        SENSOR, K_DN_per_e=K, read_e=read_e, bits=bits, black_DN=black_DN, full_well_e=well, dark_e_per_s=0.0
+    )
+    for seed in range(3):
+        value, sigma = estimate(measure(replace(heavy, other_noise=student(freedom)), seed), "sigma_d_e")
+        assert abs(value - read_e) < 4.5 * sigma
+        assert sigma < 0.3 * read_e
+
+
+def test_offsets_of_pixels_are_not_lost_among_noise_with_tails() -> None:
+    """Pixels that jump are noisy in the average of a few frames: left out as defects, they take no noise with them."""
+    rng, rows = np.random.default_rng(4), LineNoise(Quantity(0.0, 0.0, False), 299.0, False)
+    noise = np.where(rng.random((300, 300)) < 0.08, 3.0, 1.0)
+    dark = 64.0 + 0.3 * rng.standard_normal(noise.shape) + noise * rng.standard_normal(noise.shape)
+    temporal = Quantity(float(np.mean(noise**2)), 1e-6)
+    for tails in (True, False):
+        found = dsnu(dark, temporal, rows, rows, 1, NoiseRules().defect_sigma, 1, tails)
+        assert found.sigma < 0.09
+        assert (abs(found.variance - 0.09) < 2.5 * found.sigma) is tails

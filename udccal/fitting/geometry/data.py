@@ -180,6 +180,8 @@ def gather(
     parts = {-1: (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))}
     for number, arrays in enumerate(zip(board, image, given, strict=True)):
         try:
+            if any(np.iscomplexobj(one) for one in arrays):
+                raise TypeError("numpy would drop a part of complex numbers")
             points, pixels, own = (np.asarray(one, dtype=np.float64) for one in arrays)
         except (TypeError, ValueError):
             kinds = ", ".join(found_instead(one) for one in arrays[:2])

@@ -11,6 +11,7 @@ from typing import final
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
+from scipy.special import ndtr
 
 from udccal.arguments import found_instead
 from udccal.errors import FitError
@@ -283,12 +284,41 @@ class _Bracket:
                 f"Light near saturation is off by {-100 * bend:+.2g} % of that in shorter exposures: the response "
                 "bends otherwise than the noise model's. Fit the noise with frames of this sensor."
             )
+        if scatter == 1 and not black_DN and not differs:
+            for i in self._alone(merged):
+                yield f"The light of frame {i} differs from that of the others. {advice}"
         if unlike.size:
             frames = f"frames {' and '.join(map(str, unlike))} differs, and no other frame tells which one is right"
             yield f"The light of {frames}: frame {unlike[0]} is left out. {advice}"
         elif differs:
             few = "too few pixels have a third sample that tells which one is right"
             yield f"The light of frame {scores.argmax()} differs from that of the frames beside it, and {few}. {advice}"
+
+    def _alone(self, merged: BlockMerge) -> Iterator[int]:
+        """Frames with too few samples clear of clipping to be judged by these, which are not what the others say.
+
+        Clipped or not, a sample is compared to the mean of a normal one that may clip.
+        """
+        part, level = self.part(np.s_[:: max(1, self.codes.shape[1] // _JUDGED)]), float(self.sensor.level_e)
+        unjudged = np.isinf(self._frames_light(merged, 2, 3.0)[1]) & ~self.dropped.all(axis=1)
+        for i in np.flatnonzero(unjudged & (self.dropped.sum() + 1 < len(self.times))).tolist():
+            rest, time = part.without(i).merged(), float(self.times[i])
+            known = np.flatnonzero(rest.used)
+            mean = (rest.rate[known].astype(np.float64) + float(self.sensor.dark_e_per_s)) * time
+            variance = np.maximum(mean, 0.0) + float(self.sensor.floor_e2) + (rest.sigma[known] * time) ** 2
+            sigma, codes = np.sqrt(variance), part.codes[i : i + 1, known].astype(np.float64)
+            light = np.asarray(self.sensor.electrons(codes))[0]
+            room = (level - mean) / sigma
+            below, density = ndtr(room), np.exp(-0.5 * room**2) / math.sqrt(2 * math.pi)
+            expected = mean * below - sigma * density + level * (1 - below)
+            square = (mean**2 + variance) * below - sigma * (level + mean) * density + level**2 * (1 - below)
+            spread = np.sqrt(np.maximum(square - expected**2, 0.0))
+            off = np.clip(np.minimum(light, level) - expected, -(most := self.rules.believed_sigma * spread), most)
+            # Others clip whatever their light is.
+            free = (room > -5) | (light < level)
+            least = self.rules.frame_off * float(np.abs(expected[free]).sum())
+            if abs(float(off[free].sum())) > max(least, self.rules.frame_sigma * float(np.linalg.norm(spread[free]))):
+                yield i
 
     def _stuck(self) -> Int[np.ndarray, " stuck"]:
         """Open frames that have one code at all pixels, where noise of some codes makes that impossible."""
@@ -316,7 +346,9 @@ class _Bracket:
         expected = 1 - np.minimum(known * seen.times**2 / seen.variance, 1) + offset**2 / seen.variance
         dof = max(float(np.sum(expected[clear])), 1e-9)
         found = float(np.sum(chi2[clear])) / dof
-        return found if abs(found - 1) > max(self.rules.scatter_off, 6 * math.sqrt(2 / dof)) else 1.0
+        # Hits that are not found add to the scatter, and nothing but a wrong noise model takes from it.
+        sigmas = 6.0 if found > 1 else 3.5
+        return found if abs(found - 1) > max(self.rules.scatter_off, sigmas * math.sqrt(2 / dof)) else 1.0
 
     def _black_off(self, merged: BlockMerge) -> float:
         """The error of the black level, which is the same in all exposures, in electrons; 0 where it is small."""

@@ -308,6 +308,12 @@ def fit_dark(
     lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
     information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
     widen = np.sqrt([1.0, 1.0, 1.0, len(pairs), 1.0])
-    cov = found.with_rest(scaled_inverse(information) * np.outer(widen, widen))
+    inverse = scaled_inverse(information)
+    cov = found.with_rest(inverse * np.outer(widen, widen))
+    # The mean of its rows moves all codes of a pair, which coarse codes take for another shape: a step from black that
+    # is off in one pair has this pair's information as its right side.
+    alone = [replace(problem, pairs=(pair,)).equations_at(values).shared[0] for pair in pairs]
+    by_rows = sigma_row_DN / np.sqrt([[2 * pair.rows] for pair in pairs]) * alone @ inverse
+    cov += by_rows.T @ by_rows
     levels = np.array([problem.level(pair, values) for pair in pairs]).T
     return DarkFit(values, cov, found.converged, bool(np.abs(levels[0] - 1).max() < rules.white), *levels)

@@ -38,7 +38,7 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature
         single = replace(single, variance=single.variance + columns.drawn_DN4(seen.frames - 1))
     temporal = Quantity(single.value / stack.frames, single.variance / stack.frames**2)
     rules = data.rules
-    offsets = dsnu(stack.mean_DN, temporal, codes.rows, columns, stack.frames, rules.defect_sigma, data.q_DN)
+    offsets = dsnu(stack.mean_DN, temporal, codes.rows, columns, stack.frames, rules.defect_sigma, data.q_DN, foreign)
     if not codes.white:
         # Rounding biases the average: the histograms tell the offsets.
         sigma, pixels = float(np.hypot(fit.cov[3, 3] ** 0.5, codes.unresolved_DN2)), stack.mean_DN.size
@@ -235,15 +235,28 @@ def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float) -> tuple[Q
             p = pair_probability(pair, values, K_DN_per_e, codes.row_DN, 0.0)
             by_row = row_gain(pair, values, K_DN_per_e, codes.row_DN) * codes.row_DN
             expected[i] = float(np.sum(p * pair.differences_DN**2)) / (2 * float(p.sum())) - by_row**2
-    more = unexplained_variance(data, expected, data.rules.most_hits, codes.columns, codes.skewed)
-    if abs(more.value) > data.rules.foreign_sigma * more.variance**0.5:
+    # Tails that are heavier than the family's heaviest.
+    heavy = codes.white and values[4] <= LOW[4] + 1e-3
+    most_hits = 0.0 if heavy else data.rules.most_hits
+    more = unexplained_variance(data, expected, most_hits, codes.columns, codes.skewed)
+    if heavy or abs(more.value) > data.rules.foreign_sigma * more.variance**0.5:
         # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
         # codes tell of the rest depends on the distribution as well.
         depends_on = 0.0 if codes.white else 0.25 * more.value**2 + variance
-        return Quantity(max(read + more.value, 0.0), more.variance + depends_on), True
+        lost = _cut_off(data)
+        return Quantity(max(read + more.value + lost, 0.0), more.variance + depends_on + lost**2), True
     if read <= 1.001 * LOW[2]:
         return Quantity(0.0, max(variance, LOW[2] ** 2)), False
     return Quantity(read, variance), False
+
+
+def _cut_off(data: NoiseMoments) -> float:
+    """Variance that code 0 takes off dark samples, which is as uncertain as it is large.
+
+    Beyond x, tails that fall as 1 / |x|^5 have the mean square 2 x^2, of which code 0 leaves x^2.
+    """
+    of_zero = [float(of.codes[0]) * of.level_DN**2 / float(of.codes.sum()) for of in data.dark_moments]
+    return float(np.mean(of_zero))
 
 
 def unexplained_variance(
@@ -252,14 +265,21 @@ def unexplained_variance(
     """Temporal variance of dark samples, without row noise, less that expected in each pair.
 
     It comes from the differences of the codes, and its sigma from their fourth moment and the draws of ``columns``.
+    Where few differences have most of it, too few of them are found more often than too many, and the fourth moment is
+    then small as well: the sigma is larger by three times the skewness of the mean. No pair has weight by its own
+    fourth moment, for the same reason.
+
     Differences taken for hits count where they are more than ``most_hits`` of all: radiation does not hit so often, so
     that they are tails of the noise, or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the
     variance over all pixels). Pixels far from the others count only where ``of_all`` is True: hot ones have shot noise,
     dead ones have none.
     """
-    values, variances = _temporal(data, most_hits, columns, of_all)
-    weights = 1.0 / variances
-    return Quantity(float(np.average(values - expected_DN2, weights=weights)), float(1.0 / weights.sum()))
+    values, variances, thirds = _temporal(data, most_hits, columns, of_all)
+    weights = np.array([of.pixels for of in data.dark_moments]) / np.maximum(expected_DN2, data.rounding_DN2) ** 2
+    weights /= weights.sum()
+    variance = float(weights**2 @ variances)
+    skewness = float(weights**3 @ thirds) / variance**1.5
+    return Quantity(float(weights @ (values - expected_DN2)), variance * (1 + 3 * skewness) ** 2)
 
 
 def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
@@ -267,7 +287,7 @@ def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
 
     Then exposure times are those of other frames. Where black drifts, noise rises with neither.
     """
-    values, variances = _temporal(data, data.rules.most_hits, dark.columns, dark.skewed)
+    values, variances, _ = _temporal(data, data.rules.most_hits, dark.columns, dark.skewed)
     means, times = np.array([(pair.mean_DN, pair.exposure_s) for pair in data.darks]).T
 
     def off(signal_DN: PerPair) -> float:
@@ -281,12 +301,18 @@ def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
     return bool(beyond and by_time > most and off(means) < 0.1 * by_time)
 
 
-def _temporal(data: NoiseMoments, most_hits: float, columns: LineNoise, of_all: bool) -> tuple[PerPair, PerPair]:
-    """Temporal variance of each dark pair, and its own variance."""
+def _temporal(
+    data: NoiseMoments, most_hits: float, columns: LineNoise, of_all: bool
+) -> tuple[PerPair, PerPair, PerPair]:
+    """Temporal variance of each dark pair, its own variance, and its third moment."""
     tails = sum(of.outliers for of in data.dark_moments) > most_hits * sum(of.pixels for of in data.dark_moments)
-    values, variances = [], []
+    values, variances, thirds = [], [], []
     for pair, of in zip(data.darks, data.dark_moments, strict=True):
         values.append((of.temporal_DN2 if of_all else of.near_DN2) + tails * of.outlier_variance_DN2)
-        fourth = (np.sum(pair.counts * pair.differences_DN**4) + tails * of.outlier_powers[1]) / of.pixels
+        fourth, sixth = (
+            (np.sum(pair.counts * pair.differences_DN**power) + tails * of.outlier_powers[power // 2 - 1]) / of.pixels
+            for power in (4, 6)
+        )
         variances.append(max(fourth / 4 - values[-1] ** 2, values[-1] ** 2) / of.pixels + columns.drawn_DN4(1))
-    return np.array(values), np.maximum(variances, 1e-30)
+        thirds.append(sixth / 8 / of.pixels**2)
+    return np.array(values), np.maximum(variances, 1e-30), np.array(thirds)

@@ -96,9 +96,9 @@ class Moments:
     these, spatial and temporal; ``shift_DN`` is the mean of each frame less that of all. ``rows`` and ``columns`` are
     what changes of their means from frame to frame; those of columns are without those of rows. ``at_peak`` is the
     fraction of the samples with the largest code, and ``codes`` the histogram of the first frame. ``outliers`` were
-    hits, and left out; ``outlier_powers`` are the sums of the second and fourth powers of their differences from the
-    first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``far`` is how many
-    pixels lie outside the window of the dark histograms in both of these, and what they have of all frames' squares.
+    hits, and left out; ``outlier_powers`` are the sums of the second, fourth and sixth powers of their differences
+    from the first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``far`` is how
+    many pixels lie outside the window of the dark histograms in both of these, and what they have of all squares.
     ``repeated``: some frames are copies of others.
     """
 
@@ -116,7 +116,7 @@ class Moments:
     at_peak: Float[np.ndarray, " bins"]
     codes: Int[np.ndarray, " codes"]
     outliers: int
-    outlier_powers: tuple[float, float]
+    outlier_powers: tuple[float, float, float]
     shared: Shared
     far: tuple[int, float]
     repeated: bool
@@ -202,7 +202,7 @@ class _Sums:
         self._width = self._right.sum(axis=0, dtype=np.float64)
         self._counts = np.outer(self._down.sum(axis=1), self._width)
         self._total, self._squares = np.zeros(first.shape, np.float32), np.zeros_like(self._counts)
-        self._outliers, self._powers = 0, np.zeros(2)
+        self._outliers, self._powers = 0, np.zeros(3)
         self._shared: Shared | None = None
         self._marks = [_fingerprint(first)]
         none = *(np.zeros(side) for side in first.shape), np.zeros_like(self._counts), np.zeros(far.size)
@@ -257,7 +257,7 @@ class _Sums:
             at_peak=(at_peak[peaks == peaks.max()].sum(axis=0) / (number * counts)).ravel(),
             codes=np.bincount(self._first.ravel()),
             outliers=self._outliers,
-            outlier_powers=(float(self._powers[0]), float(self._powers[1])),
+            outlier_powers=(float(self._powers[0]), float(self._powers[1]), float(self._powers[2])),
             shared=self._shared or Shared(),
             far=(self._far.size, float(np.var(far, axis=0).sum()) * number),
             repeated=len(set(marks)) < len(marks),
@@ -274,7 +274,7 @@ class _Sums:
         if hits.any():
             large = square[hits].astype(np.float64)
             self._outliers += large.size
-            self._powers += [large.sum(), np.square(large).sum()]
+            self._powers += [large.sum(), (large**2).sum(), (large**3).sum()]
             difference[hits] = 0.0
         return difference
 

@@ -58,11 +58,13 @@ def dsnu(
     frames: int,
     defect_sigma: float,
     q_DN: int,
+    tails: bool,
 ) -> Pattern:
     """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), with row and column patterns.
 
     The average of so many ``frames`` has the variance ``temporal`` [DN^2], of which ``columns`` is a part, without the
-    noise of ``rows``; both are one frame's. ``q_DN`` is the converter's step.
+    noise of ``rows``; both are one frame's. ``q_DN`` is the converter's step. Where the noise has heavy ``tails``, what
+    lies up to twice as far off as a defect may be one, or noise that the average of few frames still has.
     """
     about = dark_DN.astype(np.float64)
     sample = about[:: max(1, len(about) // 256)]
@@ -74,8 +76,9 @@ def dsnu(
     bad = np.abs(about - middle) > max(reach, float(sample.std()), 1e-12)
     mean = float(about[~bad].mean()) if not bad.all() else 0.0
     about -= mean
-    about[bad] = 0.0
     (height, width), samples = about.shape, int(about.size - bad.sum())
+    doubtful = 0.5 * tails * float(np.sum(about[bad & (np.abs(about) <= 2 * reach)] ** 2)) / max(samples, 1)
+    about[bad] = 0.0
     total = float(np.vdot(about, about)) / max(samples - 1, 1)
     by_row, by_column = float(np.var(about.mean(axis=1))), float(np.var(about.mean(axis=0)))
     pixel, row, column = max(total - by_row - by_column, 0.0), rows.DN2.value / frames, columns.DN2.value / frames
@@ -85,7 +88,7 @@ def dsnu(
     # may by chance be weak in the average.
     drawn = float(np.sum(2 * np.maximum(parts**2 - own**2, np.square([0.0, row, column])) / counts))
     drawn += temporal.variance + rows.DN2.variance * rows.DN2.there / frames**2
-    variance, sigma = total - temporal.value - row, float(np.sqrt(drawn))
+    variance, sigma = total - temporal.value - row + doubtful, float(np.sqrt(drawn + doubtful**2))
     return Pattern(variance, sigma, samples, int(bad.sum()), _first_places(bad), mean)
 
 

@@ -72,10 +72,10 @@ def _rounding_left(dark: DarkTerms, V0: float, spread2: float, q: int) -> float:
 
     Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) f(2 pi k / q) / (pi k) to the mean of noise that has the
     characteristic function f (Widrow and Kollar, Quantization Noise, chapter 5). Tails leave more of it than normal
-    noise does; as much as Laplace's where the fitted shape has them.
+    noise does; as much as Laplace's where the fitted shape may have them.
     """
     frequency = 2 * np.pi * np.arange(1, 8) / q
-    if dark.foreign or dark.shape.value < -(dark.shape.variance**0.5):
+    if dark.foreign or dark.shape.value < dark.shape.variance**0.5:
         read = 1 / (1 + 0.5 * frequency**2 * V0)
     else:
         quantile, probability = standard_cdf(dark.shape.value)
