@@ -54,7 +54,7 @@ class PlanOptions:
     kernel_columns: int = KERNEL_COLUMNS
     grid_rows: int = 7
     grid_columns: int = 9
-    tile_rows: int = 160
+    tile_rows: int = 192
     tile_columns: int = 160
     interpolation: Interpolation = Interpolation.CUBIC
     network_views: int = 4

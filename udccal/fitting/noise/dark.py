@@ -99,8 +99,11 @@ def _fit_codes(data: NoiseMoments, K_DN_per_e: float, start: Five) -> _Codes:
     # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
     white = fit.follows and 4 * np.pi**2 * float(fit.values[2]) >= rules.smeared * data.q_DN**2
     if not white:
-        # Coarse codes hardly show the distribution, and all that they tell but its shape depends on it.
-        fit = fit.doubted(np.append(fitted(row_DN, fit.values, True).values[:4], fit.values[4]))
+        # Coarse codes hardly show the distribution, and all that they tell depends on it: of noise below a fifth of a
+        # code, its shape as well.
+        normal = fitted(row_DN, fit.values, True).values
+        shown = float(fit.values[2]) >= (0.2 * data.q_DN) ** 2
+        fit = fit.doubted(np.append(normal[:4], fit.values[4] if shown else normal[4]))
         fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
     return _Codes(fit, rows, row_DN, columns, unresolved, white, np.zeros(2))
 
