@@ -176,11 +176,11 @@ def _clipped(
     tile: Float32[np.ndarray, "tile tile"],
     most_e: float,
     noise_e: Float32[np.ndarray, "1 3"],
-    given: tuple[Tables, TileLayout, Pattern, int],
+    given: tuple[Tables, TileLayout, Pattern],
 ) -> Float32[np.ndarray, "tile tile"]:
     """Clip a tile, and complete it as restoration does."""
     held = np.minimum(tile, np.float32(most_e))
-    tables, layout, pattern, _ = given
+    tables, layout, pattern = given
     return completed(held, tile > most_e, noise_e[0], tables.at(0), layout, pattern, THOROUGH)
 
 
