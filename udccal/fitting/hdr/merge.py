@@ -213,7 +213,9 @@ class _Bracket:
 
     def _frame_scores(self, merged: BlockMerge, least: int, bright: float) -> Float[np.ndarray, " n"]:
         """The same in sigma; 0 where it is little."""
-        off, sigma = self._frames_light(merged, least, bright)
+        return self._in_sigma(*self._frames_light(merged, least, bright))
+
+    def _in_sigma(self, off: Float[np.ndarray, " n"], sigma: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         return np.where(np.abs(off) > self.rules.frame_off, np.abs(off) / sigma, 0.0)
 
     def _bend(self, merged: BlockMerge) -> float:
@@ -262,7 +264,8 @@ class _Bracket:
             )
         scatter, black_DN = self._scatter(merged), self._black_off(merged) / self.sensor.e_per_DN
         # Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
-        scores = self._frame_scores(merged, 2, 3.0)
+        off, sigma = self._frames_light(merged, 2, 3.0)
+        scores = self._in_sigma(off, sigma)
         differs = scores.max() > self.rules.frame_sigma * max(scatter, 1.0) ** 0.5 and not black_DN
         if scatter != 1 and not differs:
             yield (
@@ -285,7 +288,7 @@ class _Bracket:
                 "bends otherwise than the noise model's. Fit the noise with frames of this sensor."
             )
         if scatter == 1 and not black_DN and not differs:
-            for i in self._alone(merged):
+            for i in self._alone(np.isinf(sigma)):
                 yield f"The light of frame {i} differs from that of the others. {advice}"
         if unlike.size:
             frames = f"frames {' and '.join(map(str, unlike))} differs, and no other frame tells which one is right"
@@ -294,14 +297,14 @@ class _Bracket:
             few = "too few pixels have a third sample that tells which one is right"
             yield f"The light of frame {scores.argmax()} differs from that of the frames beside it, and {few}. {advice}"
 
-    def _alone(self, merged: BlockMerge) -> Iterator[int]:
-        """Frames with too few samples clear of clipping to be judged by these, which are not what the others say.
+    def _alone(self, unjudged: Bool[np.ndarray, " n"]) -> Iterator[int]:
+        """Those of the frames with too few samples clear of clipping to be judged that are not what the others say.
 
         Clipped or not, a sample is compared to the mean of a normal one that may clip.
         """
         part, level = self.part(np.s_[:: max(1, self.codes.shape[1] // _JUDGED)]), float(self.sensor.level_e)
-        unjudged = np.isinf(self._frames_light(merged, 2, 3.0)[1]) & ~self.dropped.all(axis=1)
-        for i in np.flatnonzero(unjudged & (self.dropped.sum() + 1 < len(self.times))).tolist():
+        unjudged = unjudged & ~self.dropped.all(axis=1) & bool(self.dropped.sum() + 1 < len(self.times))
+        for i in np.flatnonzero(unjudged).tolist():
             rest, time = part.without(i).merged(), float(self.times[i])
             known = np.flatnonzero(rest.used)
             mean = (rest.rate[known].astype(np.float64) + float(self.sensor.dark_e_per_s)) * time
