@@ -22,13 +22,12 @@ from udccal.fitting.psf.kernel import (
     SLANT,
     WAVELENGTHS_NM,
     Evaluator,
-    Kernel,
     fit_lattice,
 )
-from udccal.fitting.psf.problem import DiffractionProblem, stepped
+from udccal.fitting.psf.problem import DiffractionProblem, kernel_of, stepped
 from udccal.fitting.psf.samples import gather
 from udccal.fitting.psf.start import start_model, start_prior, wavelengths_nm
-from udccal.models.lattice import lattice_for, sample
+from udccal.models.lattice import lattice_for
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
@@ -119,9 +118,8 @@ def light_errors(scene: Scene, prior: Prior, shots: Shots) -> list[float]:
     for per_px in (12, PER_PX, 4):
         evaluator = replace(problem.evaluator, lattice=lattice_for(rows, columns, per_px, per_px))
         overlaps = evaluator.overlaps(prior.mean, one.frame)
-        kernel = np.asarray(evaluator.kernel(prior.mean, one.frame, one.disc_px, overlaps))
-        light = sample(evaluator.lattice, kernel, one.points.reshape(-1, 2)) * one.density.reshape(-1, 1)
-        lit.append((light * one.colour.reshape(-1, 3)).sum(axis=1))
+        kernel = kernel_of(evaluator, prior.mean, replace(one, overlaps=np.asarray(overlaps)))
+        lit.append(one.unit_light(kernel, np.zeros((len(one.points), 2))).ravel())
     return [float(np.linalg.norm(light - lit[0]) / np.linalg.norm(lit[0])) for light in lit[1:]]
 
 
@@ -147,8 +145,8 @@ def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray
             other[number] += move
             # The kernel of the same numbers: what changes is the overlaps.
             overlaps = problem.evaluator.overlaps(other, one.frame)
-            kernel = np.asarray(problem.evaluator.kernel(theta, one.frame, one.disc_px, overlaps))
-            lit.append(one.unit_light(Kernel(problem.evaluator.lattice, kernel), own[0, :, :2]))
+            kernel = kernel_of(problem.evaluator, theta, replace(one, overlaps=np.asarray(overlaps)))
+            lit.append(one.unit_light(kernel, own[0, :, :2]))
         wanted.append((lit[0] - lit[1]) / (2 * step_mm))
     return np.moveaxis(np.asarray(one.by_overlaps), -1, 0), np.stack(wanted)
 
