@@ -9,13 +9,18 @@ import numpy as np
 from tests.benchmarks.robust.family import WORST_Z, Answer, Case, Family, Number, all_finite
 from tests.scenes.stamps import SHAPES, Drawn, drawn
 from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.fit import StampsPsf, fit_psf_stamps
+from udccal.result import FitResult
 
 _WRONG = ("hits", "positions", "missing", "lost", "noise")
 # Of the pixels of held-out kernels, all but one in a thousand count: each kernel has up to 961.
 _PART = 0.999
-# A kernel's error is that of a few patterns, which scatters: twice the stated one is held to be as bad as 4.5 sigma.
-_TWICE = WORST_Z / 2
+# Where one pattern dominates a kernel's error, such as light that lies evenly all over a stamp, the error is |x| times
+# its RMS, x normal. It scatters by this part of the RMS, and |x| of 4.5 is this many times the scatter above the RMS.
+# Errors of many patterns scatter less.
+_SCATTER = np.sqrt(1 - 2 / np.pi)
+_SCATTERS = (WORST_Z - 1) / _SCATTER
+_PLACES, _DRAWS = 8, 64
 
 
 def draw(seed: int) -> Case:
@@ -59,13 +64,23 @@ def _answer(data: Drawn) -> Answer:
     result = fit_psf_stamps(data.stamps)
     if not result.ok:
         return Answer(False, result.notes, (), all_finite(result.cov, result.chi2_dof))
-    found, stated, z = data.errors(result.term, 8)
-    size = float(np.sqrt((found**2).mean())), float(np.sqrt((stated**2).mean()))
+    found, stated, z = data.errors(result.term, _PLACES)
+    off, expected = (float(np.sqrt((part**2).mean())) for part in (found, stated))
     numbers = (
         Number("pixels of held-out kernels", float(np.quantile(np.abs(z), _PART)), 1.0),
-        Number("held-out kernels, RMS", size[0], size[1] / _TWICE),
+        Number("held-out kernels, RMS", max(off - expected, 0.0), _scatter(result, data) * _SCATTERS / WORST_Z),
     )
     return Answer(True, result.notes, numbers, all_finite(found, stated, z, result.cov, result.chi2_dof))
+
+
+def _scatter(result: FitResult[StampsPsf], data: Drawn) -> float:
+    """By how much the relative L2 error of all held-out kernels together scatters, by the result's own posterior."""
+    places = data.held_out(_PLACES)
+    best, posterior = result.term.predict(places), result.posterior
+    assert posterior is not None
+    size = np.linalg.norm(best, axis=(1, 2))
+    drawn = (term.predict(places) - best for term in posterior.draws(np.random.default_rng(0), _DRAWS))
+    return float(np.std([np.sqrt(((np.linalg.norm(off, axis=(1, 2)) / size) ** 2).mean()) for off in drawn]))
 
 
 # Limits of a fit of 60 stamps.

@@ -275,8 +275,8 @@ def test_faint_rings_are_within_their_error_bars() -> None:
     """They are as sharp as the core, and the darkness around them sets the prior's smoothness."""
     data = drawn("airy", 14, 20, 21, 232596.29344151155, 7.4220437730305155, (154.56643272042552, 0.0), varies=0.068)
     _, _, z = data.errors(fit_psf_stamps(data.stamps).term, 8)
-    # Without sizes that follow the squares of nodes of similar light, 4.2.
-    assert np.quantile(np.abs(z), 0.999) < 3.9
+    # Without sizes that follow the squares of nodes of similar light, 4.2; without doubt about the prior, 3.5.
+    assert np.quantile(np.abs(z), 0.999) < 3.3
 
 
 @pytest.mark.medium

@@ -12,7 +12,7 @@ from tests.scenes.stamps import drawn as whole
 from udccal.fitting.psf_stamps.data import StampsRules
 from udccal.fitting.psf_stamps.field import Changes
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.model_error import _larger, _surely_off, drawn
+from udccal.fitting.psf_stamps.model_error import _larger, _surely_off, drawn, widen
 from udccal.fitting.psf_stamps.probability import faintest
 from udccal.fitting.psf_stamps.search import start
 from udccal.numerics import in_float64
@@ -55,6 +55,20 @@ def test_positions_that_are_exchanged_are_told() -> None:
     exchanged = fit_psf_stamps(replace(stamps, position_px=np.roll(stamps.position_px, 7, axis=0)))
     assert exchanged.status is FitStatus.POOR_FIT
     assert "has its own position" in exchanged.notes[0]
+
+
+@in_float64
+def test_nodes_that_only_the_prior_determines_scatter_more() -> None:
+    stamps, rules = make(1)[0], StampsRules()
+    state, rng = start(stamps, rules, 1), np.random.default_rng(5)
+    for scale, factor in ((1e-6, 1.0), (1e6, np.sqrt(1.5))):
+        before = scale * rng.standard_normal((state.vector.size, 8))
+        after = before.copy()
+        widen(state, after, 0.5)
+        old, new = (Changes.of(state.field, len(stamps.unit), each) for each in (before, after))
+        np.testing.assert_allclose(new.nodes, factor * old.nodes, rtol=1e-3)
+        np.testing.assert_array_equal(new.stars, old.stars)
+        np.testing.assert_array_equal(new.maps, old.maps)
 
 
 @in_float64

@@ -146,6 +146,9 @@ class StampsRules:
         new_map: the same of higher degrees. They start nearly absent; one update makes them appear where the data
             support them.
         draws: numbers of posterior draws: for updates of precisions, and for error bars (5 % of a sigma).
+        prior_doubt: part by which the variance of nodes that the prior alone determines is larger than the prior's.
+            0.5 keeps all but a thousandth of a kernel's pixels within 4.1 sigma on the seven of 350 drawn sets where
+            they reached 4.3 to 4.7 without it.
         parts: of the stars, of which one at a time is left out to see the errors of the others' field.
         inflate_above: reduced chi-squared above which every sigma grows with its root. Counts are skewed, so that
             their chi-squared scatters more than that of normal samples.
@@ -180,6 +183,7 @@ class StampsRules:
     most_pedestal: float = 0.1
     new_map: float = 3e4
     draws: tuple[int, int] = (16, 192)
+    prior_doubt: float = 0.5
     parts: int = 4
     inflate_above: float = 1.05
     noise_off: float = 0.1

@@ -19,7 +19,7 @@ from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
 from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_of_light, see
-from udccal.fitting.psf_stamps.model_error import drawn, without_error
+from udccal.fitting.psf_stamps.model_error import drawn, widen, without_error
 from udccal.fitting.psf_stamps.probability import LEAST, State, expectation
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
 from udccal.fitting.psf_stamps.slope import without_slope
@@ -242,11 +242,15 @@ def _report(
     chi2_dof = float(z @ z) / max(z.size - effective, 1.0)
     inflation = float(np.sqrt(chi2_dof)) if chi2_dof > rules.inflate_above else 1.0
     # In place: of a field of ten images, each copy of the draws takes 0.1 GB.
+    widen(state, draws, rules.prior_doubt)
     draws *= inflation
     draws += drawn(state, *draws.shape)
     # The way that is left, and on to what the data alone prefer, is one more standard deviation: kernels with more
-    # structure than the priors expect are smoothed by about as much.
-    way = posterior.mode + posterior.solved(state.prior @ state.vector)
+    # structure than the priors expect are smoothed by about as much. What is smoothed already pulls too little, so that
+    # the way is taken again from its own end.
+    way = np.zeros_like(state.vector)
+    for _ in range(2):
+        way = posterior.mode + posterior.solved(state.prior @ (state.vector + way))
     draws += way[:, None] * np.random.default_rng(3).standard_normal(rules.draws[1])
     draws /= np.sqrt(rules.draws[1])
     term = _term(stamps, state, draws)

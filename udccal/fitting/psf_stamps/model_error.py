@@ -174,20 +174,36 @@ def resized(stamps: Stamps, state: State, rules: StampsRules) -> State:
     One smoothness serves all light: darkness is smoother, and faint rings and orders of diffraction are as sharp as the
     core, so that error bars of these would be too small.
     """
-    (root, counts), draws = state.roots, laplace(stamps, state).draws(np.random.default_rng(0), rules.draws[0])
-    ends = np.cumsum(counts)[: state.of_images.size].reshape(state.of_images.shape)[:, 0, 1]
-    precision, size = np.repeat(state.precisions, counts), state.size.copy()
-    # Of each node, the squares that are there, and the part of them that the data leave open: 1 is expected together.
-    squares = [precision * ((root @ each) ** 2).mean(axis=1) for each in (state.vector[:, None], draws)]
-    by_light = _groups(state)[1]
-    for plane, end in enumerate(ends):
-        nodes = size[plane].size
-        there, left = (part[end - 2 * nodes : end].reshape(2, nodes).sum(axis=0) for part in squares)
+    draws, by_light = laplace(stamps, state).draws(np.random.default_rng(0), rules.draws[0]), _groups(state)[1]
+    # What is there, and the part that the data leave open: 1 is expected of a node together.
+    squares, size = (_of_first_images(state, each) for each in (state.vector[:, None], draws)), state.size.copy()
+    for plane, (there, left) in enumerate(zip(*squares, strict=True)):
         group = by_light[plane].ravel() - by_light[plane].min()
         known = np.maximum(np.bincount(group, 1.0 - left), 0.0)
         ratio = np.maximum((1.0 + np.bincount(group, there)) / (1.0 + known), 1.0)
         size[plane] *= np.sqrt(ratio[group]).reshape(size[plane].shape)
     return replace(state, size=size)
+
+
+def _of_first_images(state: State, vectors: Float[np.ndarray, "unknowns k"]) -> Float[np.ndarray, "planes nodes"]:
+    """Return mean squares of the first images' nodes, in units of what the prior expects of each."""
+    root, counts = state.roots
+    ends = np.cumsum(counts)[: state.of_images.size].reshape(state.of_images.shape)[:, 0, 1]
+    parts, nodes = [], state.size[0].size
+    for end, precisions in zip(ends, state.of_images[:, 0], strict=True):
+        squares = ((root[end - 2 * nodes : end] @ vectors) ** 2).mean(axis=1)
+        parts.append(precisions @ squares.reshape(2, nodes))
+    return np.stack(parts)
+
+
+def widen(state: State, draws: Float[np.ndarray, "unknowns k"], doubt: float) -> None:
+    """Let draws scatter more, in place, by a variance of ``doubt`` at nodes that the prior alone determines.
+
+    One smoothness serves all nodes. A single ring, or an order of diffraction at the edge, may leave it by more than a
+    Gaussian lets it, as light that is spread over a few nodes only has heavier tails. Where data tell, they decide.
+    """
+    left = np.clip(_of_first_images(state, draws), 0.0, 1.0).reshape(state.size.shape)
+    Changes.of(state.field, len(state.light_e), draws).nodes[:, 0] *= np.sqrt(1.0 + doubt * left)[..., None]
 
 
 def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknowns k"]:
