@@ -185,3 +185,14 @@ def errors_in_sigma(result: FitResult[Noise], sensor: ToySensor) -> Float[np.nda
         # What rounding leaves of the shape is known to its prior alone, and a saturation of codes is exact.
         z.append((found.value - value) / found.sigma if found.sigma > 0 else 1e6 * float(found.value != value))
     return np.array(z)
+
+
+def capture(sensor: ToySensor, seed: int) -> tuple[list[ExposureLevel], SpatialStack]:
+    """Frames of all levels, two of a kind, and a stack."""
+    rng = np.random.default_rng(seed)
+    shoot = partial(expose, sensor, patterns(sensor, rng), rng=rng)
+    times = [sensor.exposure_s(level) for level in sensor.levels]
+    levels = [ExposureLevel(t, (shoot(t, False), shoot(t, False)), (shoot(t, True), shoot(t, True))) for t in times]
+    t = sensor.exposure_s(sensor.stack_level)
+    dark, bright = ([shoot(t, lit) for _ in range(sensor.stack_frames)] for lit in (False, True))
+    return levels, SpatialStack(t, dark, bright)

@@ -1,8 +1,7 @@
-"""The noise term from plain arrays: on sensors of known numbers, at random, and with frames that are none."""
+"""The noise term from plain arrays: on sensors of known numbers, and at random."""
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,29 +14,17 @@ from hypothesis import strategies as st
 from tests.scenes.noise import (
     PLAIN,
     ToySensor,
+    capture,
     chosen_terms,
     errors_in_sigma,
-    expose,
     measure,
-    patterns,
     sensor_with,
     truth,
 )
-from udccal.errors import FitError
-from udccal.fitting.noise.data import ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack
+from udccal.fitting.noise.data import Frame, NoiseData, NoiseRules
 from udccal.fitting.noise.fit import fit_noise
 from udccal.fitting.noise.moments import reduced
 from udccal.result import FitStatus
-
-
-def capture(sensor: ToySensor, seed: int) -> tuple[list[ExposureLevel], SpatialStack]:
-    rng = np.random.default_rng(seed)
-    shoot = partial(expose, sensor, patterns(sensor, rng), rng=rng)
-    times = [sensor.exposure_s(level) for level in sensor.levels]
-    levels = [ExposureLevel(t, (shoot(t, False), shoot(t, False)), (shoot(t, True), shoot(t, True))) for t in times]
-    t = sensor.exposure_s(sensor.stack_level)
-    dark, bright = ([shoot(t, lit) for _ in range(sensor.stack_frames)] for lit in (False, True))
-    return levels, SpatialStack(t, dark, bright)
 
 
 def test_a_bent_sensor_is_found_bent_and_every_number_within_its_error() -> None:
@@ -124,77 +111,6 @@ def test_pixels_patterns_in_a_flickering_stack_are_not_taken_for_shot_noise() ->
     assert abs(K.value - PLAIN.K_DN_per_e) < 2.5 * K.sigma
 
 
-@pytest.mark.parametrize("read_e", [0.3, 1.2])
-def test_rounding_is_in_the_sigma_of_a_saturation_between_codes(read_e: float) -> None:
-    sensor = replace(PLAIN, read_e=read_e, row_DN=0.0, DSNU_e=0.0, full_well_e=10_001.25)
-    found, true = measure(sensor, 3).estimate("saturation_DN"), truth(sensor)["saturation_DN"]
-    assert abs(found.value - true) < 3 * found.sigma
-    assert found.sigma < 0.35
-
-
-def test_rounding_of_noise_with_tails_is_in_the_sigma_of_a_saturation_between_codes() -> None:
-    def laplace(rng: np.random.Generator, size: tuple[int, ...]) -> np.ndarray:
-        return rng.laplace(size=size) / np.sqrt(2)
-
-    off = []
-    for well in (16_653.2, 16_654.4, 16_655.4):
-        sensor = replace(PLAIN, K_DN_per_e=0.2294, full_well_e=well, read_e=2.6, row_DN=0.0, DSNU_e=0.0, PRNU=0.013)
-        sensor = replace(sensor, other_noise=laplace, flux_e_per_s=5 * well)
-        found, true = measure(sensor, 3).estimate("saturation_DN"), truth(sensor)["saturation_DN"]
-        off.append(abs(found.value - true) / found.sigma)
-        assert found.sigma < 0.3
-    assert max(off) < 3
-
-
-def test_a_bend_that_unsteady_light_hides_is_in_the_sigma_of_the_gain() -> None:
-    # The lamp hides the bend from the response; the variances alone do not show it clearly, and K takes its part.
-    sensor = replace(PLAIN, rows=144, columns=192, K_DN_per_e=2.8, full_well_e=3800.0, bits=14, bend=-0.008)
-    sensor = replace(
-        sensor, black_DN=122.0, row_DN=0.0, DSNU_e=0.0, dark_e_per_s=0.0, flux_e_per_s=19_000.0, flicker=0.011
-    )
-    results = [measure(sensor, seed) for seed in range(3)]
-    gains = [result.estimate("K_DN_per_e") for result in results]
-    assert any("nonlinearity" not in [one.name for one in result.estimates] for result in results)
-    assert max(abs(K.value - 2.8) / K.sigma for K in gains) < 4
-
-
-def test_a_full_well_just_below_the_last_code_is_in_the_sigma_of_saturation() -> None:
-    # Nearly all full pixels are rounded to the last code.
-    sensor = replace(PLAIN, bits=8, K_DN_per_e=0.017, black_DN=5.0, full_well_e=249.95 / 0.017, read_e=11.0)
-    sensor = replace(sensor, row_DN=0.0, DSNU_e=0.0, flux_e_per_s=5 * 249.95 / 0.017)
-    found = measure(sensor, 2).estimate("saturation_DN")
-    assert found.value == 255
-    assert 0.05 / 3 < found.sigma < 0.1
-    beyond = measure(replace(sensor, full_well_e=2e4, read_e=60.0), 2).estimate("saturation_DN")
-    assert (beyond.value, beyond.sigma) == (255, 0)
-
-
-@pytest.mark.parametrize("brightest", [0.5, 0.7])
-def test_codes_that_end_in_one_colour_only_are_the_saturation(brightest: float) -> None:
-    # Red and blue get half of green's light: less than half of the frame's samples have the converter's last code.
-    colours = np.tile([[-0.5, 0.0], [0.0, -0.4]], (48, 64))
-    sensor = replace(PLAIN, bits=10, K_DN_per_e=0.1, full_well_e=20_000.0, read_e=15.0, DSNU_e=5.0, pattern=colours)
-    sensor = replace(sensor, flux_e_per_s=1e5, levels=(*np.linspace(0.04, 0.4, 9).tolist(), brightest), stack_level=0.2)
-    levels, stack = capture(sensor, 1)
-    saturation = fit_noise(NoiseData(levels, stack, bayer=True, top_code=1023)).estimate("saturation_DN")
-    assert abs(saturation.value - 1023) <= saturation.sigma
-    assert saturation.sigma < 0.35
-
-
-@pytest.mark.parametrize("brightest", [1.15, 0.95])
-def test_flats_that_clip_in_their_middle_alone_show_saturation(brightest: float) -> None:
-    """No bin is full. Just below saturation, nothing piles up, and the converter's end is the only bound."""
-    y, x = np.mgrid[-1:1:96j, -1:1:128j]
-    sensor = replace(PLAIN, pattern=-0.4 * (x**2 + y**2), levels=(*PLAIN.levels[:-1], brightest))
-    levels, stack = capture(sensor, 3)
-    result = fit_noise(NoiseData(levels, stack, top_code=4095))
-    found, true = result.estimate("saturation_DN"), truth(sensor)["saturation_DN"]
-    seen = brightest > 1
-    assert any("No flat reached saturation" in note for note in result.notes) != seen
-    assert abs(found.value - true) < 3 * found.sigma
-    assert (found.sigma < 0.5) == seen
-
-
 def test_hot_pixels_are_named() -> None:
     levels, stack = capture(PLAIN, 6)
     for frame in stack.dark:
@@ -215,108 +131,6 @@ def test_residuals_are_those_of_normal_noise_and_lie_on_the_sensor() -> None:
     assert middle == pytest.approx([0.5 * (sensor.columns - 1), 0.5 * (sensor.rows - 1)], abs=3.0)
     assert sample.positions_px.min() >= 0
     assert (sample.positions_px < [sensor.columns, sensor.rows]).all()
-
-
-FRAME = np.full((32, 32), 100, np.uint16)
-
-
-@pytest.mark.parametrize(
-    ("levels", "stack", "sentence"),
-    [
-        ([ExposureLevel(0.1, (FRAME,), ())], None, "two dark frames"),
-        ([ExposureLevel(-1.0, (FRAME, FRAME), ())], None, "exposure in seconds"),
-        ([ExposureLevel(float("nan"), (FRAME, FRAME), ())], None, "exposure in seconds"),
-        ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME), -5.0)], None, "number of photons"),
-        ([], SpatialStack(float("nan"), [FRAME] * 2, [FRAME] * 2), "the stack to have an exposure in seconds"),
-        ([], SpatialStack(0.1, [FRAME] * 2, [FRAME] * 2, -5.0), "the stack to have a number of photons"),
-        ([ExposureLevel(0.1, (FRAME, FRAME[:20]), (FRAME, FRAME))], None, "found"),
-        ([ExposureLevel(0.1, (lambda: FRAME.astype(float), FRAME), (FRAME, FRAME))], None, "uint8 or uint16"),
-        ([ExposureLevel(0.1, (lambda: "frame", FRAME), (FRAME, FRAME))], None, "found str"),
-        ([ExposureLevel(0.1, (FRAME[:4], FRAME[:4]), (FRAME, FRAME))], None, "samples a side"),
-        ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))], SpatialStack(0.1, [FRAME], [FRAME]), "stack"),
-        ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME + np.uint16(60000),) * 2)], None, "top_code"),
-        ([ExposureLevel(0.1, (FRAME + np.uint16(60000),) * 2, (FRAME, FRAME))], None, "exchanged"),
-    ],
-)
-def test_what_is_no_frame_is_refused(levels: list[ExposureLevel], stack: SpatialStack | None, sentence: str) -> None:
-    with pytest.raises(FitError, match=sentence):
-        fit_noise(NoiseData(levels, stack, top_code=4095))
-
-
-def _unplugged() -> np.ndarray:
-    raise OSError("disk gone")
-
-
-def test_a_frame_that_cannot_be_loaded_is_named() -> None:
-    """The function's own error came through, which says nothing of the frame."""
-    levels = [ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME)), ExposureLevel(0.2, (FRAME, _unplugged), ())]
-    with pytest.raises(FitError, match=r"loads dark frame 1 of the pair of 0\.2 s, found OSError: disk gone"):
-        fit_noise(NoiseData(levels))
-
-
-@pytest.mark.parametrize(("arguments", "kind"), [((5, None), "Noise"), ((None, 5), "NoiseRules")])
-def test_arguments_of_another_kind_are_refused(arguments: tuple[Any, Any], kind: str) -> None:
-    """They ended in an AttributeError, or in the result."""
-    without_checks_of_types = inspect.unwrap(fit_noise)
-    with pytest.raises(FitError, match=f"Expected a {kind}, found 5"):
-        without_checks_of_types(NoiseData([]), *arguments)
-
-
-def test_an_exposure_that_is_a_frame_is_refused() -> None:
-    level = ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))
-    # What runs with types checked refuses it earlier.
-    object.__setattr__(level, "exposure_s", FRAME)
-    with pytest.raises(FitError, match=r"level 0 to have an exposure in seconds .* found uint16 of shape \(32, 32\)"):
-        fit_noise(NoiseData([level]))
-
-
-@pytest.mark.parametrize(
-    ("changed", "sentence"),
-    [
-        ({"levels": None}, "sequence of exposure levels, found NoneType"),
-        ({"levels": (level for level in [])}, "sequence of exposure levels, found generator"),
-        ({"levels": ExposureLevel(0.1)}, "sequence of exposure levels, found ExposureLevel"),
-        ({"levels": [FRAME]}, "every level as an ExposureLevel, found uint16"),
-        ({"top_code": "4095"}, "top_code as a whole number from 1 to 65535, found '4095'"),
-        ({"top_code": float("nan")}, "found nan"),
-        ({"top_code": 1e9}, "found 1000000000.0"),
-        ({"top_code": True}, "found True"),
-        ({"top_code": 70_000}, "found 70000"),
-    ],
-)
-def test_data_of_another_kind_are_refused(changed: dict[str, Any], sentence: str) -> None:
-    data = NoiseData([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))])
-    for name, value in changed.items():
-        object.__setattr__(data, name, value)
-    with pytest.raises(FitError, match=sentence):
-        fit_noise(data)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "sentence"),
-    [
-        ("exposure_s", True, "level 0 to have an exposure in seconds .* found True"),
-        ("photons", True, "level 0 to have a number of photons .* found True"),
-        ("dark", None, "dark frames of level 0 as a sequence, found NoneType"),
-        ("bright", (frame for frame in [FRAME]), "bright frames of level 0 as a sequence, found generator"),
-    ],
-)
-def test_a_level_of_another_kind_is_refused(name: str, value: Any, sentence: str) -> None:
-    level = ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))
-    object.__setattr__(level, name, value)
-    with pytest.raises(FitError, match=sentence):
-        fit_noise(NoiseData([level]))
-
-
-def test_pairs_may_be_arrays() -> None:
-    levels, stack = capture(PLAIN, 3)
-    stacked = [replace(of, dark=np.stack(list(of.dark)), bright=np.stack(list(of.bright))) for of in levels]
-    alike = [fit_noise(NoiseData(these, stack, top_code=4095)) for these in (levels, stacked)]
-    assert [one.value for one in alike[0].estimates] == [one.value for one in alike[1].estimates]
-
-
-def test_nothing_at_all_is_too_few() -> None:
-    assert fit_noise(NoiseData([])).status is FitStatus.TOO_FEW_DATA
 
 
 # A failing example is shown as drawn: to shrink it would take hundreds of fits.
