@@ -112,7 +112,8 @@ def test_sigma_of_any_function_is_that_of_kernels_and_stars_written_out(fitted: 
     found = fitted.sigma_of(lambda t: np.log(t.star_light_e))
     assert found.shape == stars.light_e.shape
     peaks = [term.predict(place)[:, 7, 7] for term in fitted.posterior.draws(np.random.default_rng(0), 200)]
-    np.testing.assert_allclose(np.std(peaks, axis=0), fitted.term.sigma(place)[:, 7, 7], rtol=0.2)
+    # Draws also hold products of the errors of an image and of its strength.
+    np.testing.assert_allclose(np.std(peaks, axis=0), fitted.term.sigma(place)[:, 7, 7], rtol=0.5)
 
 
 def test_kernels_sum_to_one_and_are_centred(fitted: FitResult[StampsPsf]) -> None:

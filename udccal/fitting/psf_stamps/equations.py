@@ -20,7 +20,17 @@ from scipy.linalg.blas import dtrsm
 
 from udccal.fitting.engine.least_squares import Step
 from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.field import BACKGROUND, OWN, TAPS, Changes, PsfField, by_maps, changes_of_light, taps
+from udccal.fitting.psf_stamps.field import (
+    BACKGROUND,
+    OWN,
+    TAPS,
+    Changes,
+    PsfField,
+    by_maps,
+    changes_of_images,
+    changes_of_light,
+    taps,
+)
 from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
 
 REACH, ACROSS = TAPS - 1, 2 * TAPS - 1  # of nodes that a sample has in common, along an axis
@@ -186,10 +196,12 @@ def changes_of_samples(
 ) -> Float[np.ndarray, "stars samples k"]:
     """Return the changes of samples' expectation under changes of all unknowns, zero for unused samples."""
     out = np.zeros((stamps.known.size, draws.shape[1]))
-    for plane, nodes in enumerate(Changes.of(field, len(stamps.unit), draws).nodes):
+    changes = Changes.of(field, len(stamps.unit), draws)
+    for plane in range(len(field.nodes)):
         index, shared = shared_by(field, stamps.unit, plane)
         used = np.flatnonzero(seen.weight * stamps.by_plane[plane])
-        out[used] = changes_of_light(field, seen.seen, stamps.unit, shared @ draws[index], nodes, used)
+        images = changes_of_images(field, stamps.unit, changes, plane)
+        out[used] = changes_of_light(seen.seen, shared @ draws[index], images, used)
     return out.reshape(*stamps.known.shape, -1)
 
 

@@ -94,8 +94,10 @@ class PsfField(eqx.Module):
         """Return the field after the first of these changes."""
         parts = zip(self.dense, self.split(changes.maps[:, 0]), strict=True)
         warp, lateral, pedestal = (old + own.reshape(np.shape(old)) for old, own in parts)
-        nodes = self.nodes + changes.nodes[..., 0]
-        return replace(self, nodes=nodes, warp=warp, lateral=lateral, pedestal=pedestal)
+        nodes, mix = self.nodes + changes.nodes[..., 0], self.mix
+        if changes.mix.size:
+            mix = mix + changes.mix[..., 0]
+        return replace(self, nodes=nodes, warp=warp, lateral=lateral, pedestal=pedestal, mix=mix)
 
 
 class Changes(NamedTuple):
@@ -105,20 +107,24 @@ class Changes(NamedTuple):
         stars: (x, y) in px, then relative light by colour, then background by colour in electrons.
         maps: the map's numbers, the lateral colour's, pedestals. With ``stars`` they form the equations' dense block.
         nodes: in the vector colour by colour and node by node, the images of a node together.
+        mix: of the images' strengths; a vector may end before these, as a fit holds them.
     """
 
     stars: Float[np.ndarray, "stars own k"]
     maps: Float[np.ndarray, "numbers k"]
     nodes: Float[np.ndarray, "planes images grid_rows grid_columns k"]
+    mix: Float[np.ndarray, "_ terms k"]
 
     @classmethod
     def of(cls, field: PsfField, stars: int, vector: Shaped[np.ndarray, "unknowns k"]) -> Changes:
         """Split a vector into its parts."""
         planes, images, *grid = field.nodes.shape
-        ends = np.cumsum([stars * (2 + 2 * planes), sum(part.size for part in field.dense)])
-        own, maps, nodes = np.split(vector, ends)
+        ends = np.cumsum([stars * (2 + 2 * planes), sum(part.size for part in field.dense), field.nodes.size])
+        own, maps, nodes, mix = np.split(vector, ends)
         nodes = np.moveaxis(nodes.reshape(planes, *grid, images, -1), 3, 1)
-        return cls(own.reshape(stars, 2 + 2 * planes, -1), maps, nodes)
+        terms = field.mix.shape[1]
+        of_mix = mix.reshape(len(mix) // terms, terms, vector.shape[1])
+        return cls(own.reshape(stars, 2 + 2 * planes, -1), maps, nodes, of_mix)
 
 
 class Seen(NamedTuple):
@@ -200,18 +206,26 @@ def by_maps(
     return np.concatenate(index), scipy.sparse.csr_array(scipy.sparse.hstack(parts, format="csr"))
 
 
+def changes_of_images(
+    field: PsfField, unit: Float[np.ndarray, "stars 2"], changes: Changes, plane: int
+) -> Float[np.ndarray, "stars grid_rows grid_columns k"]:
+    """Return changes of a colour's image at each star."""
+    images = np.tensordot(field.strengths(unit), changes.nodes[plane], axes=1)
+    if changes.mix.size:
+        strengths = np.tensordot(polynomials(unit, degree_of(field.mix.shape[1])), changes.mix, axes=(1, 1))
+        images += np.einsum("stk,tyx->syxk", strengths, field.nodes[plane])
+    return images
+
+
 def changes_of_light(
-    field: PsfField,
     seen: Seen,
-    unit: Float[np.ndarray, "stars 2"],
     own: Float[np.ndarray, "parameters k"],
-    nodes: Float[np.ndarray, "images grid_rows grid_columns k"],
+    images: Float[np.ndarray, "stars grid_rows grid_columns k"],
     used: Int[np.ndarray, " used"],
 ) -> Float[np.ndarray, "used k"]:
-    """Return changes of light in samples under changes of stars' own parameters, and of a colour's nodes."""
+    """Return changes of light in samples under changes of stars' own parameters, and of a colour's images."""
     stars, samples, count = seen.jacobian.shape
     by_own = (seen.jacobian @ own.reshape(stars, count, own.shape[1])).reshape(stars * samples, own.shape[1])
-    images = np.tensordot(field.strengths(unit), nodes, axes=1)
     weights = taps(seen, used, images.shape[1:3])
     return by_own[used] + weights @ images.reshape(weights.shape[1], own.shape[1])
 

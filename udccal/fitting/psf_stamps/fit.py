@@ -18,8 +18,8 @@ from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
-from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_of_light, see
-from udccal.fitting.psf_stamps.model_error import drawn, widen, without_error
+from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_of_images, changes_of_light, see
+from udccal.fitting.psf_stamps.model_error import drawn, drawn_strengths, widen, without_error
 from udccal.fitting.psf_stamps.probability import LEAST, State, expectation
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
 from udccal.fitting.psf_stamps.slope import without_slope
@@ -173,8 +173,8 @@ class StampsPsf:
         changes = Changes.of(field, len(self.star_px), self.factor)
         seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
         index, matrix = by_maps(field, unit, plane)
-        used = np.arange(seen.value.size)
-        change = changes_of_light(field, seen, unit, matrix @ changes.maps[index], changes.nodes[plane], used)
+        images, used = changes_of_images(field, unit, changes, plane), np.arange(seen.value.size)
+        change = changes_of_light(seen, matrix @ changes.maps[index], images, used)
         return seen.value, change.reshape(*seen.value.shape, k), seen.jacobian[..., 1:3]
 
 
@@ -252,6 +252,7 @@ def _report(
     for _ in range(2):
         way = posterior.mode + posterior.solved(state.prior @ (state.vector + way))
     draws += way[:, None] * np.random.default_rng(3).standard_normal(rules.draws[1])
+    draws = np.concatenate([draws, inflation * drawn_strengths(stamps, state, rules.draws[1])])
     draws /= np.sqrt(rules.draws[1])
     term = _term(stamps, state, draws)
     # The expected error, then the maps' coefficients, named by colour, element and degrees in x and y.
