@@ -74,7 +74,7 @@ def test_nodes_that_only_the_prior_determines_scatter_more() -> None:
 @in_float64
 def test_strengths_of_images_are_as_open_as_stars_leave_them() -> None:
     """Of images with the strengths 1 and x, stars leave y open; more light tells it better."""
-    (stamps, light_e), rules = make(1), StampsRules()
+    stamps, rules = make(1)[0], StampsRules()
     state = start(stamps, rules, 1).with_images(np.eye(3)[:2], rules)
     nodes = state.field.nodes.copy()
     # An image that is neither the light nor the place of the first.
