@@ -28,7 +28,7 @@ from udccal.fitting.wire.parameters import (
     shape_vector,
     with_shape,
 )
-from udccal.fitting.wire.search import scan_rows
+from udccal.fitting.wire.search import Descent, Search, scan_rows
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, log_baseline, modulation, slopes
 
@@ -287,3 +287,23 @@ def test_scan_finds_the_standoff_from_afar(factor: float) -> None:
         places, gain = scan_rows(bare, np.ones(4), wrong, pixels, RULES)
     assert float(places[0].standoff_per_pitch) == pytest.approx(12.0, rel=0.02)
     assert gain > 1000
+
+
+def test_a_search_ends_where_descents_leave_the_places_they_began_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every descent ends at a footprint of 3 periods; 2 and 4 are tried once."""
+    wire, begun = ideal_wire(GEOMETRY, START, HARMONICS), []
+    pixels, noise = even_pixels(wire, 4e-3, 4), FlatNoise(np.zeros(4), np.full(4, 1.6e-5), 0.0, np.full(4, np.inf))
+    flat = np.ones((ROWS, COLUMNS))
+    search = Search(WireData(flat, 1.6e-5 * flat, GEOMETRY, START, 0.0, cfa="RGGB"), noise, RULES)
+    with jax.enable_x64(True):
+        ended = search._descent(wire, np.ones(4), pixels)
+
+        def begin(self: Search, place: Wire, *others: object) -> Descent:
+            begun.append(float(place.footprint_per_pitch))
+            assert len(begun) < 10
+            return ended
+
+        monkeypatch.setattr(Search, "_begun", begin)
+        found = search._search([replace(wire, fields=0.0 * wire.fields)], np.ones(4), HARMONICS, pixels)
+    assert begun == pytest.approx([3.0, 2.0, 4.0], abs=0.2)
+    assert float(found[0].wire.footprint_per_pitch) == pytest.approx(3.0, abs=0.2)
