@@ -161,11 +161,11 @@ class Search:
         Those beside the best count as well, until none of them is better. Where few pixels cannot distinguish rivals,
         all of them come back, best first.
         """
-        tried, begun, left = list[Descent](), list[Wire](), places
+        tried, beside, left = list[Descent](), list[Wire](), places
         while left:
             tried += [self._begun(place, gains, harmonics, sample) for place in left]
-            begun += left
-            left = self._beside(tried, begun, gains, sample)
+            left = self._beside(tried, beside, places[0], gains, sample)
+            beside += left
         unfinished = _rivals(tried, self.rules.unfinished)
         rivals = _rivals((self._descent(one.wire, one.gains, sample) for one in unfinished), self.rules.rival)
         best, (count, degree) = rivals[0], self.rules.free
@@ -187,18 +187,20 @@ class Search:
         wire = with_harmonics(placed, harmonics, sample, self.rules.sharpness[0])
         return self._descent(wire, gains, sample, SolverRules(least_gain=1e-2, iterations=3))
 
-    def _beside(self, tried: list[Descent], begun: list[Wire], gains: _Gains, sample: Pixels) -> list[Wire]:
-        """Places a period of the pupil's diameter beside the best, where no descent began or ended.
+    def _beside(
+        self, tried: list[Descent], before: list[Wire], bare: Wire, gains: _Gains, sample: Pixels
+    ) -> list[Wire]:
+        """Places a period of the pupil's diameter beside the best, where none was tried; ``bare`` has no modulation.
 
         For a pupil of several periods, that is one zero more, or less, in its transform. A descent may leave the size
-        that it began with: begun there again, it would do the same. Wires that were ``begun`` have no modulation.
+        that it began with: begun at a place that was given ``before``, it would do so again, without end.
         """
-        sizes, made = [float(one.footprint_per_pitch) for one in (*begun, *(one.wire for one in tried))], []
+        sizes, made = [float(one.footprint_per_pitch) for one in (*before, *(one.wire for one in tried))], []
         for best in _rivals(tried, self.rules.unfinished):
             standoff, size = (float(one) for one in (best.wire.standoff_per_pitch, best.wire.footprint_per_pitch))
             for pupil in (size - 1, size + 1):
                 if pupil > 1 and min(abs(pupil - one) for one in sizes) > 0.5:
-                    made.append(_demodulated(begun[0], gains, sample, 1, standoff, pupil))
+                    made.append(_demodulated(bare, gains, sample, 1, standoff, pupil))
                     # Of rivals two periods apart, the place between them counts once.
                     sizes.append(pupil)
         return made
