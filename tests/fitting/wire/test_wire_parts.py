@@ -12,7 +12,7 @@ import pytest
 
 from tests.scenes import wire as drawn
 from udccal.cfa import cfa_named
-from udccal.fitting.engine.least_squares import minimise
+from udccal.fitting.engine.least_squares import SolverRules, minimise
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, sample_pixels, weighed
 from udccal.fitting.wire.fit import select
 from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, expected_of, wire_derivatives
@@ -289,12 +289,31 @@ def test_scan_finds_the_standoff_from_afar(factor: float) -> None:
     assert gain > 1000
 
 
+def blank_search() -> Search:
+    """A search that is given its pixels by hand."""
+    noise, flat = FlatNoise(np.zeros(4), np.full(4, 1.6e-5), 0.0, np.full(4, np.inf)), np.ones((ROWS, COLUMNS))
+    return Search(WireData(flat, 1.6e-5 * flat, GEOMETRY, START, 0.0, cfa="RGGB"), noise, RULES)
+
+
+def test_a_footprint_that_was_tried_at_another_standoff_is_tried_again() -> None:
+    wire, search = ideal_wire(GEOMETRY, START, HARMONICS), blank_search()
+    pixels, bare = even_pixels(wire, 4e-3, 4), replace(wire, fields=0.0 * wire.fields)
+    with jax.enable_x64(True):
+
+        def at(standoff: float, footprint: float) -> Descent:
+            lengths = {"standoff_per_pitch": np.float64(standoff), "footprint_per_pitch": np.float64(footprint)}
+            return search._descent(replace(wire, **lengths), np.ones(4), pixels, SolverRules(iterations=0))
+
+        for other, beside in ((at(13.5, 4.0), [2.0, 4.0]), (at(12.02, 4.0), [2.0])):
+            places = search._beside([at(12.0, 3.0), other], [], bare, np.ones(4), pixels)
+            assert [float(one.footprint_per_pitch) for one in places] == pytest.approx(beside)
+            assert all(float(one.standoff_per_pitch) == pytest.approx(12.0) for one in places)
+
+
 def test_a_search_ends_where_descents_leave_the_places_they_began_at(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every descent ends at a footprint of 3 periods; 2 and 4 are tried once."""
-    wire, begun = ideal_wire(GEOMETRY, START, HARMONICS), []
-    pixels, noise = even_pixels(wire, 4e-3, 4), FlatNoise(np.zeros(4), np.full(4, 1.6e-5), 0.0, np.full(4, np.inf))
-    flat = np.ones((ROWS, COLUMNS))
-    search = Search(WireData(flat, 1.6e-5 * flat, GEOMETRY, START, 0.0, cfa="RGGB"), noise, RULES)
+    wire, begun, search = ideal_wire(GEOMETRY, START, HARMONICS), list[float](), blank_search()
+    pixels = even_pixels(wire, 4e-3, 4)
     with jax.enable_x64(True):
         ended = search._descent(wire, np.ones(4), pixels)
 

@@ -38,6 +38,8 @@ from udccal.models.wire import Wire
 _Gains = Float[np.ndarray, " sites"]
 # Places of faint columns to try, in periods, and the distance within which minima are one.
 _SHIFTS, _APART = np.arange(8) / 8, 1 / 32
+# Descents are of one minimum where their pupils, and their rows at the field's edge, are so many periods apart.
+_ONE_MINIMUM = np.array([0.5, 0.1])
 
 
 @final
@@ -192,17 +194,21 @@ class Search:
     ) -> list[Wire]:
         """Places a period of the pupil's diameter beside the best, where none was tried; ``bare`` has no modulation.
 
-        For a pupil of several periods, that is one zero more, or less, in its transform. A descent may leave the size
-        that it began with: begun at a place that was given ``before``, it would do so again, without end.
+        For a pupil of several periods, that is one zero more, or less, in its transform. The same pupil at another
+        stand-off is another place. A descent may leave the place that it began at: begun at one that was given
+        ``before``, it would do so again, without end.
         """
-        sizes, made = [float(one.footprint_per_pitch) for one in (*before, *(one.wire for one in tried))], []
+        half_field, made = float(np.ptp(rays_at(bare, sample).periods[1])) / 2, list[Wire]()
+        known = [_pupil_and_standoff(one) for one in (*before, *(one.wire for one in tried))]
         for best in _rivals(tried, self.rules.unfinished):
-            standoff, size = (float(one) for one in (best.wire.standoff_per_pitch, best.wire.footprint_per_pitch))
+            size, standoff = _pupil_and_standoff(best.wire)
+            unit = _ONE_MINIMUM / [1.0, half_field / standoff]
             for pupil in (size - 1, size + 1):
-                if pupil > 1 and min(abs(pupil - one) for one in sizes) > 0.5:
+                place = np.array([pupil, standoff])
+                if pupil > 1 and not any((np.abs(place - one) <= unit).all() for one in known):
                     made.append(_demodulated(bare, gains, sample, 1, standoff, pupil))
                     # Of rivals two periods apart, the place between them counts once.
-                    sizes.append(pupil)
+                    known.append(place)
         return made
 
     def _descent(
@@ -218,6 +224,10 @@ class Search:
         parameters = parameters_of(wire, self.rules, gains.size, panel=panel)
         problem = WireProblem(name, parameters, pixels, parameters.prior(self.data.start, self.rules))
         return Descent(problem, minimise(problem, parameters.vector(wire, gains), solver))
+
+
+def _pupil_and_standoff(wire: Wire) -> Float[np.ndarray, "2"]:
+    return np.array([float(wire.footprint_per_pitch), float(wire.standoff_per_pitch)])
 
 
 def _rivals(tried: Iterable[Descent], margin: float) -> list[Descent]:
