@@ -134,7 +134,8 @@ class StampsRules:
         most_work: rows of nodes times the cube of unknowns in a row; images other than the first have nodes in the
             middle of the grid only, so many that a factor takes a quarter of a second and 0.1 GB.
         most_images: largest number of images that a search tries.
-        worth_finer: expected decrease of the criterion from which denser nodes are tried.
+        worth_finer: expected decrease of the criterion from which denser nodes are tried, and chi-squared by which
+            these must change what is expected of stars, at the end, if there are several images.
         steps_to_compare, steps_to_end: most steps of one fit, for orders that are compared, and for the chosen one.
         evidence, evidence_of_nodes: a fit has converged when the last step gained less log evidence than this (or than
             the second number times the nodes), and the next predicts less than half of it in log posterior: 0.03 is a
