@@ -228,6 +228,14 @@ def test_crowded_stamps_that_many_images_do_not_describe_are_a_poor_fit() -> Non
     assert "leave out those that are crowded" in result.notes[0]
 
 
+def test_kernels_that_are_known_to_a_tenth_only_are_a_poor_fit() -> None:
+    """Rings wider than their stamps, of little light."""
+    data = drawn("donut", 80120, 40, 15, 5744.565785073317, 3.6633481159349315, (-2.1981, 0.1099), varies=0.17944)
+    result = fit_psf_stamps(data.stamps)
+    assert result.status is FitStatus.POOR_FIT
+    assert "large enough for the whole psf" in result.notes[0]
+
+
 def test_a_slope_of_the_background_is_taken_off_and_told() -> None:
     """It is that which does not grow with a star's light; hits do not count."""
     stamps = make(11)[0]

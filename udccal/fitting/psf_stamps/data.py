@@ -156,6 +156,7 @@ class StampsRules:
         noise_off: part by which reduced chi-squared is below 1 where the noise given is too large.
         poor_above: reduced chi-squared above which the fit is poor; likewise squared errors of stars that were left
             out, in units of the expected ones.
+        poor_error: expected relative error of kernels above which the fit is poor.
     """
 
     least_snr: float = 10.0
@@ -189,6 +190,7 @@ class StampsRules:
     inflate_above: float = 1.05
     noise_off: float = 0.1
     poor_above: float = 2.0
+    poor_error: float = 0.1
 
 
 def mosaic_channels(

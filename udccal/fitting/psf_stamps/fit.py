@@ -301,6 +301,9 @@ def _verdict(stamps: Stamps, found: Found, chi2_dof: float, size: float, rules: 
     if not found.converged:
         left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
         return FitStatus.NOT_CONVERGED, left
+    if size > rules.poor_error:
+        told = f"Kernels are expected to be off by {100 * size:.2g} %."
+        return FitStatus.POOR_FIT, f"{told} Give more or brighter stamps, large enough for the whole psf."
     return FitStatus.CONVERGED, ""
 
 
