@@ -96,7 +96,8 @@ class PsfField(eqx.Module):
         warp, lateral, pedestal = (old + own.reshape(np.shape(old)) for old, own in parts)
         nodes, mix = self.nodes + changes.nodes[..., 0], self.mix
         if changes.mix.size:
-            mix = mix + changes.mix[..., 0]
+            # To first order in both: images as they were, with what strengths have changed by.
+            nodes, mix = np.concatenate([nodes, self.nodes], axis=1), np.concatenate([mix, changes.mix[..., 0]])
         return replace(self, nodes=nodes, warp=warp, lateral=lateral, pedestal=pedestal, mix=mix)
 
 

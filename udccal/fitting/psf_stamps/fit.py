@@ -126,9 +126,13 @@ class StampsPsf:
     def changed(self, vector: Float[np.ndarray, " unknowns"]) -> StampsPsf:
         """Return the term with changes of its unknowns, in the order of ``Changes``; a fit's posterior draws these."""
         changes = Changes.of(self.field, len(self.star_px), vector[:, None])
+        field = self.field.moved(changes)
+        unknowns = len(self.factor) - changes.mix.size + field.nodes.size - self.field.nodes.size
         return replace(
             self,
-            field=self.field.moved(changes),
+            field=field,
+            # What is drawn has no spread of its own.
+            factor=np.zeros((unknowns, 1)),
             star_place_px=self.star_place_px + changes.stars[:, :2, 0],
             star_light_e=self.star_light_e * np.exp(changes.stars[:, 2 : 2 + len(self.field.nodes), 0]),
         )

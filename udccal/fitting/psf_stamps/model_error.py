@@ -245,8 +245,8 @@ def drawn_strengths(stamps: Stamps, state: State, count: int) -> Float[np.ndarra
     out = np.zeros((*field.mix.shape, count))
     if not (further and free.size):
         return out.reshape(-1, count)
-    known, shape = _known_strengths(stamps, state), (free.shape[1], further)
-    precision = np.einsum("sf,sg,stu->ftgu", every @ free, every @ free, known).reshape((np.prod(shape),) * 2)
+    at_stars, known, shape = every @ free, _known_strengths(stamps, state), (free.shape[1], further)
+    precision = np.einsum("sf,sg,stu->ftgu", at_stars, at_stars, known).reshape((np.prod(shape),) * 2)
     precision += free.shape[1] / len(have) * np.eye(len(precision))
     normal = np.random.default_rng(2).standard_normal((len(precision), count))
     found = solve_triangular(cholesky(precision, lower=True), normal, lower=True, trans=1)

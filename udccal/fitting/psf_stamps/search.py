@@ -212,9 +212,11 @@ def _denser(stamps: Stamps, state: State, rules: StampsRules) -> State:
     if there.margin * denser[0] > state.margin * state.field.spacing_px:
         return state
     finer = improve(stamps, there, rules, rules.steps_to_compare).place
+    if len(state.field.mix) == 1:
+        return finer
     before, after = (expectation(stamps, one) for one in (state, finer))
     changed = float((before.weight * (after.mean_e - before.mean_e) ** 2).sum())
-    return finer if len(state.field.mix) == 1 or changed > rules.worth_finer else state
+    return finer if changed > rules.worth_finer else state
 
 
 def attempt(stamps: Stamps, found: Found, rules: StampsRules) -> Attempt[Found]:
