@@ -10,9 +10,9 @@ import pytest
 from tests.fitting.psf_stamps.test_psf_stamps import READ_E, make
 from tests.scenes.stamps import drawn as whole
 from udccal.fitting.psf_stamps.data import StampsRules
-from udccal.fitting.psf_stamps.field import Changes, polynomials
+from udccal.fitting.psf_stamps.field import Changes
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.model_error import _larger, _surely_off, drawn, drawn_strengths, widen
+from udccal.fitting.psf_stamps.model_error import _larger, _surely_off, drawn, widen
 from udccal.fitting.psf_stamps.probability import faintest
 from udccal.fitting.psf_stamps.search import start
 from udccal.numerics import in_float64
@@ -69,33 +69,6 @@ def test_nodes_that_only_the_prior_determines_scatter_more() -> None:
         np.testing.assert_allclose(new.nodes, factor * old.nodes, rtol=1e-3)
         np.testing.assert_array_equal(new.stars, old.stars)
         np.testing.assert_array_equal(new.maps, old.maps)
-
-
-@in_float64
-def test_strengths_of_images_are_as_open_as_stars_leave_them() -> None:
-    """Of images with the strengths 1 and x, stars leave y open; more light tells it better."""
-    stamps, rules = make(1)[0], StampsRules()
-    state = start(stamps, rules, 1).with_images(np.eye(3)[:2], rules)
-    nodes = state.field.nodes.copy()
-    # An image that is neither the light nor the place of the first.
-    nodes[:, 1] = 0.3 * np.roll(nodes[:, 0], 3, axis=1) * state.kept[..., 1]
-    state, sigma = replace(state, field=replace(state.field, nodes=nodes)), []
-    for more in (1.0, 100.0):
-        lit = replace(stamps, read_e=np.sqrt(more) * stamps.read_e)
-        draws = drawn_strengths(lit, replace(state, light_e=more * state.light_e), 2000).reshape(2, 3, -1)
-        np.testing.assert_array_equal(draws[0], 0.0)
-        at_stars = polynomials(stamps.unit, 1) @ draws[1]
-        np.testing.assert_allclose(state.field.strengths(stamps.unit).T @ at_stars, 0.0, atol=1e-9)
-        sigma.append(draws[1].std(axis=1)[np.abs(draws[1]).mean(axis=1).argmax()])
-    assert sigma[0] / sigma[1] == pytest.approx(10.0, rel=0.1)
-
-
-@pytest.mark.medium
-def test_an_image_whose_strength_few_stars_tell_is_within_its_error_bars() -> None:
-    data = whole("coma", 60012, 20, 15, 6976.908343339181, 2.323407029492466, (4.7054, 0.9411), 0.3360969897651572)
-    _, _, z = data.errors(fit_psf_stamps(data.stamps).term, 8)
-    # With strengths held as the search finds them, 5.2.
-    assert np.quantile(np.abs(z), 0.999) < 4.5
 
 
 @in_float64

@@ -19,10 +19,11 @@ from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
 from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_of_images, changes_of_light, see
-from udccal.fitting.psf_stamps.model_error import drawn, drawn_strengths, widen, without_error
+from udccal.fitting.psf_stamps.model_error import drawn, widen, without_error
 from udccal.fitting.psf_stamps.probability import LEAST, State, expectation
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
 from udccal.fitting.psf_stamps.slope import without_slope
+from udccal.fitting.psf_stamps.strengths import drawn_strengths
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 

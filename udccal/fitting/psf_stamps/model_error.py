@@ -13,14 +13,13 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import cholesky, solve_triangular
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.misfit import SIGNIFICANT, chi2_tail
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.equations import changes_of_samples, laplace
-from udccal.fitting.psf_stamps.field import Changes, degree_of, polynomials
+from udccal.fitting.psf_stamps.field import Changes
 from udccal.fitting.psf_stamps.probability import State, Weighted, expectation, laplacian
 
 _NEAR_PX = 2.0  # size of the squares whose nodes are near each other
@@ -60,7 +59,7 @@ def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> tuple
         seen = expectation(stamps, there)
         root = np.sqrt(seen.weight)[..., None]
         change = root * changes_of_samples(stamps, there.field, seen, draws)
-        taken = np.linalg.qr(root * _by_star(stamps, there, seen))[0]
+        taken = np.linalg.qr(root * by_star(stamps, there, seen))[0]
         change -= taken @ (taken.transpose(0, 2, 1) @ change)
         every = 1.0 - (taken**2).sum(axis=2) + (change**2).mean(axis=2)
         square[out] = (seen.residual**2)[out]
@@ -98,7 +97,7 @@ def placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> S
     planes = state.light_e.shape[1]
     for _ in range(4):
         seen = expectation(stamps, state)
-        jacobian = _by_star(stamps, state, seen)
+        jacobian = by_star(stamps, state, seen)
         weighted = (jacobian * seen.weight[..., None]).transpose(0, 2, 1)
         step = (scaled_inverse(weighted @ jacobian) @ weighted @ seen.residual[..., None])[..., 0] * stars[:, None]
         centre, light, background = np.split(step, [2, 2 + planes], axis=1)
@@ -111,7 +110,7 @@ def placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> S
     return state
 
 
-def _by_star(stamps: Stamps, state: State, seen: Weighted) -> Float[np.ndarray, "stars samples own"]:
+def by_star(stamps: Stamps, state: State, seen: Weighted) -> Float[np.ndarray, "stars samples own"]:
     """Return derivatives of samples by (x, y), light by colour, and background by colour where there is one."""
     own = np.moveaxis(stamps.by_plane, 0, 2)
     parts = [seen.seen.jacobian[..., 1:3], seen.seen.jacobian[..., :1] * own, *([own] if state.lit else [])]
@@ -225,47 +224,3 @@ def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknown
         in_step = (total[:, image] / total[:, 0])[:, None, None] * first * left[image]
         nodes[:, image] += in_step[..., None] * rng.standard_normal(count)
     return out
-
-
-def drawn_strengths(stamps: Stamps, state: State, count: int) -> Float[np.ndarray, "coefficients k"]:
-    """Draw what stars leave open of the strengths of images, in the order of ``Changes.mix``.
-
-    A search takes strengths from noisy residuals, and fits hold them. Given the images, each star tells its own
-    strengths, with its place and light taken up, and polynomials make of these what they are elsewhere: most is left
-    open at the field's edge. What is in step with a strength that is there, nodes take up. Before the data, all further
-    polynomials together are as large as a strength.
-    """
-    field, terms = state.field, state.field.mix.shape[1]
-    every, have = polynomials(stamps.unit, degree_of(terms)), field.strengths(stamps.unit)
-    (taken, root), further = np.linalg.qr(have), have.shape[1] - 1
-    inside = taken.T @ every
-    _, size, ways = np.linalg.svd(every - taken @ inside, full_matrices=False)
-    ways = ways[size > 1e-6].T / size[size > 1e-6]
-    free = ways - np.transpose(field.mix) @ np.linalg.solve(root, inside @ ways)
-    out = np.zeros((*field.mix.shape, count))
-    if not (further and free.size):
-        return out.reshape(-1, count)
-    at_stars, known, shape = every @ free, _known_strengths(stamps, state), (free.shape[1], further)
-    precision = np.einsum("sf,sg,stu->ftgu", at_stars, at_stars, known).reshape((np.prod(shape),) * 2)
-    precision += free.shape[1] / len(have) * np.eye(len(precision))
-    normal = np.random.default_rng(2).standard_normal((len(precision), count))
-    found = solve_triangular(cholesky(precision, lower=True), normal, lower=True, trans=1)
-    out[1:] = np.einsum("pf,ftk->tpk", free, found.reshape(*shape, count))
-    return out.reshape(-1, count)
-
-
-def _known_strengths(stamps: Stamps, state: State) -> Float[np.ndarray, "stars further further"]:
-    """Return each star's information on the strengths of images other than the first."""
-    seen, mix = expectation(stamps, state), np.asarray(state.field.mix)
-    root = np.sqrt(seen.weight)[..., None]
-    by_strength = np.zeros((*seen.weight.shape, len(mix) - 1))
-    for image in range(1, len(mix)):
-        # Light is linear in strengths, and the first polynomial is 1.
-        more = mix.copy()
-        more[image, 0] += 1.0
-        there = replace(state, field=replace(state.field, mix=more))
-        by_strength[..., image - 1] = expectation(stamps, there).mean_e - seen.mean_e
-    by_strength *= root
-    taken = np.linalg.qr(root * _by_star(stamps, state, seen))[0]
-    by_strength -= taken @ (taken.transpose(0, 2, 1) @ by_strength)
-    return np.asarray(by_strength.transpose(0, 2, 1) @ by_strength)

@@ -30,6 +30,7 @@ from udccal.fitting.psf_stamps.probability import (
     grid_size,
     log_posterior,
 )
+from udccal.fitting.psf_stamps.strengths import settled
 from udccal.models.fields import polynomial_terms
 
 _LEAST_PART = 0.01  # of a step to the mode
@@ -191,7 +192,7 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
     state = best.fit.place if orders else _denser(stamps, best.fit.place, rules)
     state = without_outliers(stamps, state, rules)
     error, off = of_stars_left_out(stamps, state, rules)
-    state = replace(state, model_error=error, left_out_off=off)
+    state = settled(stamps, replace(state, model_error=error, left_out_off=off))
     found = improve(stamps, state, rules, rules.steps_to_end)
     final = replace(best, fit=replace(found, place=resized(stamps, found.place, rules)))
     return Choice(final, (*(t for t in tried if t is not best), final))
