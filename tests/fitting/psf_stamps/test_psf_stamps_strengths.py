@@ -58,16 +58,20 @@ def test_strengths_of_images_are_as_open_as_stars_leave_them() -> None:
     assert sigma[0] / sigma[1] == pytest.approx(10.0, rel=0.1)
 
 
+@pytest.mark.parametrize("term", [2, 4])
 @in_float64
-def test_strengths_go_where_stars_have_them() -> None:
-    """The search found x alone; stars say x, and a tenth of what is free of 1 and x."""
+def test_strengths_go_where_stars_have_them(term: int) -> None:
+    """Of the own degree, and of one more than the search allows; what is in step with 1 and x, nodes take up."""
     stamps, found = with_strengths()
-    sigma = open_part(stamps, found)
-    for part in (0.1, -0.02):
-        truth = replace(found, field=replace(found.field, mix=found.field.mix + part * sigma / sigma[1, 2]))
-        moved = settled(seen_by(stamps, truth, 1), found).field.mix
-        assert abs(part) / sigma[1, 2] > 10
-        np.testing.assert_allclose(moved, truth.field.mix, atol=4 * sigma[1, 2])
+    found, every = replace(found, field=replace(found.field, mix=np.eye(6)[:2])), polynomials(stamps.unit, 2)
+    free = np.eye(6)[term] - np.pad(np.linalg.lstsq(every[:, :2], every[:, term], rcond=None)[0], (0, 4))
+    truth = replace(found, field=replace(found.field, mix=found.field.mix + 0.1 * np.array([[0.0], [1.0]]) * free))
+    moved = settled(seen_by(stamps, truth, 1), with_strengths()[1])
+    at = polynomials(np.random.default_rng(5).uniform(-0.9, 0.9, (50, 2)), 2)
+    sigma = (at @ drawn_strengths(stamps, moved, 2000).reshape(2, 6, -1)[1]).std(axis=1)
+    before, after = (at @ (one.field.mix[1] - truth.field.mix[1]) for one in (found, moved))
+    assert np.abs(after / sigma).max() < 4
+    assert np.linalg.norm(after) < 0.1 * np.linalg.norm(before)
 
 
 @in_float64

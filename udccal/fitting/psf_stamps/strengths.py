@@ -17,6 +17,7 @@ from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.field import degree_of, polynomials
 from udccal.fitting.psf_stamps.model_error import by_star
 from udccal.fitting.psf_stamps.probability import State, expectation
+from udccal.models.fields import polynomial_terms
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,12 @@ class _Free:
 def settled(stamps: Stamps, state: State) -> State:
     """Return the state with the likeliest strengths, under a prior whose width has the most evidence.
 
-    Polynomials that the field does not need would only extrapolate the stars' noise to its edge.
+    Polynomials that the field does not need would only extrapolate the stars' noise to its edge. One degree more than
+    the search allows may be needed there, and is part of what stars leave open.
     """
+    if len(state.field.mix) == 1:
+        return state
+    state = _with_degree(state)
     if (free := _free(stamps, state)) is None:
         return state
     precisions, ways = np.linalg.eigh(free.precision)
@@ -54,6 +59,13 @@ def settled(stamps: Stamps, state: State) -> State:
     found = free.mix(ways @ (score / (precisions + priors[np.argmax(evidence)])))
     mix = np.concatenate([state.field.mix[:1], state.field.mix[1:] + found])
     return replace(state, field=replace(state.field, mix=mix))
+
+
+def _with_degree(state: State) -> State:
+    """Return the state with room for one more degree in the strengths."""
+    terms = state.field.mix.shape[1]
+    more = polynomial_terms(degree_of(terms) + 1) - terms
+    return replace(state, field=replace(state.field, mix=np.pad(state.field.mix, ((0, 0), (0, more)))))
 
 
 def drawn_strengths(stamps: Stamps, state: State, count: int) -> Float[np.ndarray, "coefficients k"]:
