@@ -303,12 +303,12 @@ def _verdict(stamps: Stamps, found: Found, chi2_dof: float, size: float, rules: 
     if not found.converged and len(found.place.field.mix) >= rules.most_images:
         told = f"{rules.most_images} images did not describe the stamps, and error bars do not hold."
         return FitStatus.POOR_FIT, f"{told} Check that each stamp holds one star; leave out those that are crowded."
-    if not found.converged:
-        left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
-        return FitStatus.NOT_CONVERGED, left
     if size > rules.poor_error:
         told = f"Kernels are expected to be off by {100 * size:.2g} %."
         return FitStatus.POOR_FIT, f"{told} Give more or brighter stamps, large enough for the whole psf."
+    if not found.converged:
+        left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
+        return FitStatus.NOT_CONVERGED, left
     return FitStatus.CONVERGED, ""
 
 

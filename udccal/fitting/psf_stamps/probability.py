@@ -79,6 +79,7 @@ class State:
         model_error: what the model does not describe, in light per pixel at the nodes, which adds to the noise.
         margin: of the nodes' grid, where images other than the first are zero.
         left_out_off: least relative error of stars that were left out of the fit.
+        strength_precision: of the prior of what is free of images' strengths.
     """
 
     field: PsfField
@@ -91,6 +92,7 @@ class State:
     model_error: Float[np.ndarray, "planes grid_rows grid_columns"]
     margin: int = 0
     left_out_off: float = 0.0
+    strength_precision: float = 0.0
 
     @property
     def name(self) -> str:

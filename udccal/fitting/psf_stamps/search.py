@@ -190,9 +190,9 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
     best = choose(tried).best
     # Others were compared without a model error and with the same samples left out; this fit does not compare.
     state = best.fit.place if orders else _denser(stamps, best.fit.place, rules)
-    state = without_outliers(stamps, state, rules)
+    state = settled(stamps, without_outliers(stamps, state, rules))
     error, off = of_stars_left_out(stamps, state, rules)
-    state = settled(stamps, replace(state, model_error=error, left_out_off=off))
+    state = replace(state, model_error=error, left_out_off=off)
     found = improve(stamps, state, rules, rules.steps_to_end)
     final = replace(best, fit=replace(found, place=resized(stamps, found.place, rules)))
     return Choice(final, (*(t for t in tried if t is not best), final))

@@ -56,9 +56,9 @@ def settled(stamps: Stamps, state: State) -> State:
     # The narrowest one holds strengths where they are, to a part in ten thousand.
     priors = free.least * 4.0 ** np.arange(14)[:, None]
     evidence = (np.log(priors / (precisions + priors)) + score**2 / (precisions + priors)).sum(axis=1)
-    found = free.mix(ways @ (score / (precisions + priors[np.argmax(evidence)])))
-    mix = np.concatenate([state.field.mix[:1], state.field.mix[1:] + found])
-    return replace(state, field=replace(state.field, mix=mix))
+    best = float(priors[np.argmax(evidence), 0])
+    mix = np.concatenate([state.field.mix[:1], state.field.mix[1:] + free.mix(ways @ (score / (precisions + best)))])
+    return replace(state, field=replace(state.field, mix=mix), strength_precision=best)
 
 
 def _with_degree(state: State) -> State:
@@ -69,10 +69,12 @@ def _with_degree(state: State) -> State:
 
 
 def drawn_strengths(stamps: Stamps, state: State, count: int) -> Float[np.ndarray, "coefficients k"]:
-    """Draw what stars leave open of strengths, in the order of ``Changes.mix``; the prior is the widest."""
+    """Draw what stars leave open of strengths, in the order of ``Changes.mix``, by the prior that settled them."""
     out = np.zeros((*np.shape(state.field.mix), count))
     if (free := _free(stamps, state)) is not None:
-        precision = free.precision + free.least * np.eye(len(free.precision))
+        # The likeliest width of the prior is a guess: a wider one is nearly as likely.
+        prior = max(free.least, state.strength_precision / 4.0)
+        precision = free.precision + prior * np.eye(len(free.precision))
         normal = np.random.default_rng(2).standard_normal((len(precision), count))
         out[1:] = free.mix(solve_triangular(cholesky(precision, lower=True), normal, lower=True, trans=1))
     return out.reshape(-1, count)
