@@ -19,6 +19,7 @@ OTHER_DAYS_OUT ?= other-days
 GUIDED_OUT ?= guided
 ROBUST_OUT ?= robust
 NETWORK_MINUTES ?= 60
+NETWORK ?=
 ROBUST ?=
 PEERS ?=
 USB ?=
@@ -147,9 +148,10 @@ fewer: $(STAMP)
 device: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.device
 
-# Train the network of the tier accurate for NETWORK_MINUTES; writes its weights.
+# Train the network of the tier accurate for NETWORK_MINUTES; writes its weights. NETWORK: arguments, such as --from.
 network: $(STAMP)
-	$(BIN)/python -m tests.benchmarks.network.train --minutes $(NETWORK_MINUTES)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[train]"
+	$(BIN)/python -m tests.benchmarks.network.train --minutes $(NETWORK_MINUTES) $(NETWORK)
 
 # What each stage of restoration costs, with the truth in place of all others. Writes budget.json and the table of
 # docs/restoration.md.

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.benchmarks.network.examples import INNER_PX, Examples, Optics
-from tests.benchmarks.network.pictures import drawn_picture
-from tests.benchmarks.network.train import PATCH_PX, patch
+from tests.benchmarks.network.examples import INNER_PX, PATCH_PX, Examples, Optics, patch
+from tests.benchmarks.network.pictures import drawn_picture, files, photographs
+from udccal.restoration.network import correction, shapes
 
 
 def streak() -> np.ndarray:
@@ -18,9 +20,10 @@ def streak() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def examples(tmp_path_factory: pytest.TempPathFactory) -> Examples:
-    """One kernel for every pattern; without the shared folder, so without panoramas."""
-    return Examples([Optics.of(streak(), turn) for turn in range(6)], tmp_path_factory.mktemp("data"), seed=1)
+def examples() -> Examples:
+    """One kernel for every pattern, and one picture beside those that are drawn."""
+    picture = drawn_picture(640, np.random.default_rng(7))
+    return Examples([Optics.of(streak(), turn) for turn in range(6)], [picture], seed=1)
 
 
 def test_examples_are_of_the_sizes_that_training_cuts(examples: Examples) -> None:
@@ -74,9 +77,40 @@ def test_drawn_pictures_have_edges_and_stay_in_range() -> None:
     assert not np.array_equal(pictures[0], pictures[1])
 
 
-def test_pictures_of_packages_are_found(tmp_path: Path) -> None:
-    from tests.benchmarks.network.pictures import photographs
+def test_pictures_are_found_and_some_are_held_out(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="Debian's package mate-backgrounds"):
+        photographs(tmp_path, tmp_path, np.random.default_rng(0))
+    for file in files(tmp_path).values():
+        if file.is_relative_to(tmp_path):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(file), np.random.default_rng(1).integers(0, 255, (300, 1700, 3)).astype(np.uint8))
+    own, judging = photographs(tmp_path, tmp_path, np.random.default_rng(0))
+    assert len(own) + len(judging) == len(files(tmp_path))
+    assert len(judging) == 7
+    assert all(p.ndim == 3 and p.min() >= 0 and p.max() <= 4 and max(p.shape) < 1600 for p in own + judging)
 
-    found = photographs(tmp_path, np.random.default_rng(0))
-    assert len(found) >= 14
-    assert all(p.ndim == 3 and p.min() >= 0 and p.max() <= 4 for p in found)
+
+def test_the_network_that_trains_is_the_one_that_restores() -> None:
+    torch = pytest.importorskip("torch", reason="pip install udccal[train]")
+    from tests.benchmarks.network.torch_network import Network, to_weights
+
+    rng = np.random.default_rng(3)
+    smaller = {name: rng.standard_normal(small(shape)).astype(np.float32) for name, shape in shapes().items()}
+    given = [jnp.asarray(rng.standard_normal(shape), jnp.float32) for shape in ((1, 16, 24, 9), (1, 8, 12, 12))]
+    planes = [torch.tensor(np.asarray(part).transpose(0, 3, 1, 2)) for part in given]
+    drawn, larger = Network(rng), Network(rng, smaller)
+    with torch.no_grad():
+        # It begins without a correction.
+        assert not drawn(*planes).numpy().any()
+        drawn.kernels["out"].normal_()
+    of_smaller = {name: jnp.asarray(kernel) for name, kernel in smaller.items()}
+    for network, weights in ((drawn, to_weights(drawn)), (larger, to_weights(larger)), (larger, of_smaller)):
+        expected = np.asarray(correction(weights, *given))
+        found = network(*planes).detach().numpy().transpose(0, 2, 3, 1)
+        np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def small(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """A kernel with three quarters of the channels of both levels."""
+    rows, columns, *channels = shape
+    return rows, columns, *(count if count % 32 else count * 3 // 4 for count in channels)

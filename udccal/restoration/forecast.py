@@ -34,7 +34,7 @@ _LEFT: Final = 1.6
 # scenes have. These numbers were fitted to the scenes of docs/restoration.md, of which none is flatter than FLATTEST.
 _FLAT, _EXPONENT, _COARSE, _FLATTEST = 0.41, 3.2, 0.3, 1.4
 # Variance of the error of ``accurate`` over that of ``balanced``: the median of the same scenes.
-_NETWORK: Final = 0.84
+_NETWORK: Final = 0.81
 # Width in px over which light is averaged to tell bright places from dark ones.
 _LOCAL_PX: Final = 16
 # Every n-th row and column is looked at.

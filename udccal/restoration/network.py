@@ -36,11 +36,11 @@ SHARPER = np.float32(16)
 # Detail is what differs from the mean over this many px.
 DETAIL_PX = (31, 31)
 # How far the network looks, rows that it is given at once, and the coarse level's cell.
-REACH_PX, _BLOCK_ROWS, CELL_PX = 48, 256, 4
+REACH_PX, _BLOCK_ROWS, CELL_PX = 52, 256, 4
 # Ways round in which a picture can be shown: steps through its rows and columns.
 WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))
 # Channels at half and at a quarter of the resolution, and residual blocks there.
-_FINE, _COARSE, _FINE_BLOCKS, _COARSE_BLOCKS = 40, 64, 2, 3
+_CHANNELS, BLOCKS = {"fine": 64, "coarse": 96}, {"fine": 3, "coarse": 4}
 
 WEIGHTS_FILE = Path(__file__).with_name("network.npz")
 
@@ -170,11 +170,12 @@ def network_weights() -> Weights:
 
 def shapes() -> dict[str, tuple[int, int, int, int]]:
     """Return the shape of each kernel: rows, columns, channels in, channels out."""
-    found = {"in": (3, 3, INPUTS, _FINE), "down": (2, 2, _FINE, _COARSE), "up": (1, 1, _COARSE, 4 * _FINE)}
-    for level, count, channels in (("fine", _FINE_BLOCKS, _FINE), ("coarse", _COARSE_BLOCKS, _COARSE)):
-        for block in range(count):
-            found |= {f"{level}{block}a": (3, 3, channels, channels), f"{level}{block}b": (3, 3, channels, channels)}
-    return found | {"out": (3, 3, _FINE, COLOURS * _PLACES)}
+    fine, coarse = _CHANNELS["fine"], _CHANNELS["coarse"]
+    found = {"in": (3, 3, INPUTS, fine), "down": (2, 2, fine, coarse), "up": (1, 1, coarse, 4 * fine)}
+    for level, channels in _CHANNELS.items():
+        for block in range(BLOCKS[level]):
+            found |= {f"{level}{block}{half}": (3, 3, channels, channels) for half in "ab"}
+    return found | {"out": (3, 3, fine, COLOURS * _PLACES)}
 
 
 def correction(
@@ -192,12 +193,12 @@ def correction(
     first = _convolved(jnp.concatenate([_apart(detail), noise], axis=-1), weights["in"])
     fine = _block(first, weights, "fine0")
     coarse = _convolved(fine, weights["down"], stride=2)
-    for block in range(_COARSE_BLOCKS):
+    for block in range(BLOCKS["coarse"]):
         coarse = _block(coarse, weights, f"coarse{block}")
-    fine = fine + _together(_convolved(coarse, weights["up"]), _FINE)
-    for block in range(1, _FINE_BLOCKS):
+    fine = fine + _together(_convolved(coarse, weights["up"]))
+    for block in range(1, BLOCKS["fine"]):
         fine = _block(fine, weights, f"fine{block}")
-    return _together(_convolved(jax.nn.relu(fine), weights["out"]), COLOURS)
+    return _together(_convolved(jax.nn.relu(fine), weights["out"]))
 
 
 def _block(planes: Float[Array, "n y x c"], weights: Weights, name: str) -> Float[Array, "n y x c"]:
@@ -218,11 +219,11 @@ def _apart(planes: Float[Array, "n y x c"]) -> Float[Array, "n y2 x2 c4"]:
     return planes.reshape(n, y // 2, 2, x // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, y // 2, x // 2, 4 * c)
 
 
-def _together(planes: Float[Array, "n y x c4"], channels: int) -> Float[Array, "n y2 x2 c"]:
+def _together(planes: Float[Array, "n y x c4"]) -> Float[Array, "n y2 x2 c"]:
     """Return pictures from the channels of their 2 x 2 places."""
-    n, y, x, _ = planes.shape
-    apart = planes.reshape(n, y, x, 2, 2, channels).transpose(0, 1, 3, 2, 4, 5)
-    return apart.reshape(n, 2 * y, 2 * x, channels)
+    n, y, x, c = planes.shape
+    apart = planes.reshape(n, y, x, 2, 2, c // 4).transpose(0, 1, 3, 2, 4, 5)
+    return apart.reshape(n, 2 * y, 2 * x, c // 4)
 
 
 _compiled = jax.jit(correction)

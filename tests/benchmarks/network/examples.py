@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy import fft
 
-from tests.benchmarks.network.pictures import drawn_picture, photographs
+from tests.benchmarks.network.pictures import Pictures, drawn_picture
 from udccal.cfa import Cfa, cfa_named
 from udccal.restoration.clipped import THOROUGH, completed
 from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
@@ -28,6 +27,8 @@ _TILE_PX, _CANVAS_PX = 256, 512
 # The part of a tile that restoration uses, in whole places of the network's coarse level.
 _USED_PX = 190
 INNER_PX = 188
+# Patches are cut of it. Much smaller ones would have more edge than the network ever sees at work.
+PATCH_PX = 96
 # Kernels of each simulated rig; and how their sizes vary, for rigs that nobody has drawn yet.
 _RIGS = {"lg55-reduced": 40, "lg55-aca2040": 16, "mk31-imx1600": 16}
 _STRETCH = (0.75, 1.35)
@@ -117,9 +118,8 @@ def _stretched(
 class Examples:
     """Draws examples without end."""
 
-    def __init__(self, optics: list[Optics], data: Path, seed: int) -> None:
-        self._optics, self._rng = optics, np.random.default_rng(seed)
-        self._photographs = photographs(data, np.random.default_rng(0x9407))
+    def __init__(self, optics: list[Optics], pictures: Pictures, seed: int) -> None:
+        self._optics, self._photographs, self._rng = optics, pictures, np.random.default_rng(seed)
 
     def draw(self) -> Example:
         """Draw one."""
@@ -224,3 +224,15 @@ def _display_slope(light: Float32[np.ndarray, "rows columns 3"]) -> Float32[np.n
     """Return the slope of sRGB's encoding; what is brighter than white counts little, as a display clips it."""
     slope = 1.055 / 2.4 * np.maximum(light, 0.004) ** np.float32(1 / 2.4 - 1)
     return np.where(light > 1.0, np.float32(0.1), slope)
+
+
+def patch(example: tuple[np.ndarray, ...], rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Cut a patch, at whole places of the coarse level, and mirror it."""
+    y, x = (4 * int(rng.integers((INNER_PX - PATCH_PX) // 4 + 1)) for _ in range(2))
+    down, across = rng.choice([-1, 1], 2)
+    parts = []
+    for index, array in enumerate(example):
+        step = 2 if index == 1 else 1
+        cut = array[y // step : (y + PATCH_PX) // step, x // step : (x + PATCH_PX) // step]
+        parts.append(cut[::down, ::across])
+    return tuple(parts)

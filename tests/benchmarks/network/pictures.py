@@ -19,32 +19,83 @@ from jaxtyping import Float, Float32, Int
 _COLOURED = ("astronaut.png", "chelsea.png", "coffee.png", "motorcycle_left.png", "rocket.jpg", "hubble_deep_field.jpg")
 _GREY = ("camera.png", "brick.png", "coins.png", "grass.png", "gravel.png", "page.png")
 _LEARN = ("china.jpg", "flower.jpg")
-# Panoramas that the benchmarks look at.
+# Of packages of Debian 12, below the root folder.
+_DEBIAN = {
+    "mate-backgrounds": (
+        "usr/share/backgrounds/mate/{}.jpg",
+        "nature/Blinds nature/Dune nature/LadyBird nature/RainDrops nature/Storm nature/TwoWings nature/Wood "
+        "abstract/Elephants_3840x2160",
+    ),
+    "plasma-workspace-wallpapers": (
+        "usr/share/wallpapers/{}/contents/images/2560x1600.jpg",
+        "BytheWater ColdRipple ColorfulCups EveningGlow FallenLeaf OneStandsOut Path",
+    ),
+    "opencv-doc": (
+        "usr/share/doc/opencv-doc/examples/data/{}",
+        "aloeL.jpg baboon.jpg board.jpg building.jpg chicky_512.png fruits.jpg graf1.png leuvenA.jpg rubberwhale1.png "
+        "squirrel_cls.jpg starry_night.jpg",
+    ),
+}
+# Larger pictures are halved: at full size few have detail to the pixel.
+_SHARP_PX = 1600
+# Pictures by which training is judged, and panoramas that the benchmarks look at.
+_HELD_OUT = ("coffee", "china", "Dune", "EveningGlow", "leuvenA", "baboon", "Path")
 _SEEN = ("lobby", "park")
 _OVERSAMPLED = 2
 _LEAST_PX, _MOST_PX = 1.5, 120.0
 # The longest shape, in units of its radius.
 _REACH = 5.0
 
+Pictures = list[Float32[np.ndarray, "rows columns 3"]]
 
-def photographs(data: Path, rng: np.random.Generator) -> list[Float32[np.ndarray, "rows columns 3"]]:
-    """Return photographs in linear light: those of packages, and the shared panoramas as they are.
+
+def photographs(data: Path, root: Path, rng: np.random.Generator) -> tuple[Pictures, Pictures]:
+    """Return photographs in linear light, to learn from and to judge by.
 
     Args:
         data: the shared folder; without it there are no panoramas.
+        root: below which Debian's packages lie.
         rng: of gammas and tints.
+
+    Raises:
+        FileNotFoundError: when a package is missing.
     """
-    folder, learn = Path(skimage.data_dir), Path(sklearn.datasets.__file__).parent / "images"
-    files = [*(folder / name for name in (*_COLOURED, *_GREY)), *(learn / name for name in _LEARN)]
-    found = []
-    for file in files:
+    own, judging = [], []
+    for name, file in files(root).items():
+        if not file.exists():
+            raise FileNotFoundError(_missing(file))
         display = cv2.imread(str(file), cv2.IMREAD_COLOR)[..., ::-1] / 255.0
         tint = rng.uniform(0.6, 1.0, 3) if file.name in _GREY else np.ones(3)
-        found.append(tint * display ** rng.uniform(1.8, 2.2))
+        light = _sharp(_exposed(tint * display ** rng.uniform(1.8, 2.2)))
+        (judging if name in _HELD_OUT else own).append(light)
     for file in sorted((data / "environments").glob("*.hdr")):
         if not file.stem.startswith(_SEEN):
-            found.append(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[..., ::-1])
-    return [_exposed(picture) for picture in found]
+            own.append(_exposed(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[..., ::-1]))
+    return own, judging
+
+
+def files(root: Path) -> dict[str, Path]:
+    """Return the photographs' files by name."""
+    folder, learn = Path(skimage.data_dir), Path(sklearn.datasets.__file__).parent / "images"
+    found = [*(folder / name for name in (*_COLOURED, *_GREY)), *(learn / name for name in _LEARN)]
+    named = {file.stem: file for file in found}
+    for pattern, names in _DEBIAN.values():
+        named |= {Path(name).stem: root / pattern.format(name) for name in names.split()}
+    return named
+
+
+def _missing(file: Path) -> str:
+    package = next(p for p, (pattern, _) in _DEBIAN.items() if pattern.split("{")[0] in str(file))
+    return (
+        f"Expected the pictures of Debian's package {package}, found no {file}. Install it, or unpack it "
+        "(dpkg-deb -x) and give the folder as --root."
+    )
+
+
+def _sharp(light: Float32[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "rows columns 3"]:
+    while max(light.shape) > _SHARP_PX:
+        light = cv2.resize(light, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return light
 
 
 def _exposed(picture: np.ndarray) -> Float32[np.ndarray, "rows columns 3"]:

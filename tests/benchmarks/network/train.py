@@ -1,10 +1,10 @@
 """`make network`: train the network of the tier ``accurate``.
 
-    python -m tests.benchmarks.network.train [--minutes N] [--out FILE] [--from FILE] [--data DIR]
+    python -m tests.benchmarks.network.train [--minutes N] [--from FILE] [--rate R] [--root DIR] [--out FILE]
 
 Another process draws examples while this one trains; an example is used several times, mirrored and cut anew. Every few
-minutes it prints what the network gains over the tier ``balanced`` with kernels that it does not train on, and writes
-the weights.
+minutes it prints what the network gains over the tier ``balanced`` with kernels and pictures that it does not train on,
+and writes the weights.
 """
 
 from __future__ import annotations
@@ -16,19 +16,21 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+import torch
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from tests.benchmarks.network.examples import INNER_PX, Example, Examples, Optics, drawn_kernels
-from udccal.restoration.network import WEIGHTS_FILE, Weights, correction, shapes
+from tests.benchmarks.network.examples import Example, Examples, Optics, drawn_kernels, patch
+from tests.benchmarks.network.pictures import Pictures, photographs
+from tests.benchmarks.network.torch_network import Network, to_weights
+from udccal.restoration.network import WEIGHTS_FILE, Weights, correction
 
 _DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
-PATCH_PX, _BATCH, _PER_EXAMPLE = 64, 16, 2
-_POOL, _DRAWERS = 3000, 1
-_RATE, _LEAST_RATE, _WARM_UP = 1.5e-3, 1e-5, 200
-_FIRST, _SECOND, _TINY = 0.9, 0.99, 1e-8
+_BATCH, _POOL = 8, 3000
+_LEAST_RATE, _WARM_UP = 1e-5, 200
 _AVERAGED = 0.999
-_CHECKS, _REPORT_S = 48, 240.0
+_CHECKS, _REPORT_S = 64, 300.0
 # Squared error on a display below which it does not matter, 60 dB.
 _NEGLIGIBLE = 1e-6
 Batch = tuple[np.ndarray, ...]
@@ -37,85 +39,59 @@ Batch = tuple[np.ndarray, ...]
 def main() -> None:
     """Train for some minutes."""
     options = _options()
+    # A second thread waits for the first more than it helps, and the other core draws examples.
+    torch.set_num_threads(1)
     rng = np.random.default_rng(options.seed)
-    kernels = drawn_kernels(rng)
-    held_out, own = kernels[::9], [k for index, k in enumerate(kernels) if index % 9]
-    checks = _checks(_optics(held_out), options.data, options.seed + 1)
-    pool = _Pool(own, options.data, options.seed)
-    weights = _started(options.start, rng)
-    state = (weights, jax.tree.map(jnp.zeros_like, weights), jax.tree.map(jnp.zeros_like, weights))
-    average, start, told, step = weights, time.monotonic(), time.monotonic(), 0
+    kernels, (pictures, judging) = drawn_kernels(rng), photographs(options.data, options.root, rng)
+    own = [kernel for index, kernel in enumerate(kernels) if index % 9]
+    held_out = Examples(_optics(kernels[::9]), judging, options.seed + 1)
+    checks = [held_out.draw() for _ in range(_CHECKS)]
+    pool = _Pool(own, pictures, options.seed)
+    network = Network(rng, _read(options.start)).to(memory_format=torch.channels_last)
+    average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(_AVERAGED))
+    optimiser = torch.optim.Adam(network.parameters(), betas=(0.9, 0.99))
+    start, told, step = time.monotonic(), time.monotonic(), 0
     while (elapsed := (time.monotonic() - start) / 60 / options.minutes) < 1:
         step += 1
-        rate = max(_RATE * min(step / _WARM_UP, 0.5 + 0.5 * np.cos(np.pi * elapsed)), _LEAST_RATE)
-        state, average = _step(state, average, pool.batch(rng), jnp.float32(rate), jnp.float32(step))
+        rate = max(options.rate * min(step / _WARM_UP, 0.5 + 0.5 * np.cos(np.pi * elapsed)), _LEAST_RATE)
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        optimiser.zero_grad()
+        _loss(network, *(torch.from_numpy(part) for part in pool.batch(rng))).backward()
+        optimiser.step()
+        average.update_parameters(network)
         if time.monotonic() - told > _REPORT_S:
             told = time.monotonic()
-            _report(step, pool.drawn, average, checks)
-            _write(average, options.out)
+            _report(step, pool.drawn, to_weights(average), checks)
+            _write(to_weights(average), options.out)
     pool.close()
-    _report(step, pool.drawn, average, checks)
-    _write(average, options.out)
+    _report(step, pool.drawn, to_weights(average), checks)
+    _write(to_weights(average), options.out)
 
 
 def _optics(kernels: list[np.ndarray]) -> list[Optics]:
     return [Optics.of(each, index) for index, each in enumerate(kernels)]
 
 
-def _checks(optics: list[Optics], data: Path, seed: int) -> list[Example]:
-    examples = Examples(optics, data, seed)
-    return [examples.draw() for _ in range(_CHECKS)]
-
-
-def _started(file: Path | None, rng: np.random.Generator) -> Weights:
-    """Return weights of a file, or He's; the network begins without a correction."""
-    if file is not None:
-        with np.load(file, allow_pickle=False) as stored:
-            return {name: jnp.asarray(stored[name], jnp.float32) for name in shapes()}
-    drawn = {}
-    for name, shape in shapes().items():
-        spread = np.sqrt(2 / np.prod(shape[:3])) * (0.0 if name == "out" else 0.2 if name.endswith("b") else 1.0)
-        drawn[name] = jnp.asarray(spread * rng.standard_normal(shape), jnp.float32)
-    return drawn
-
-
-def _loss(weights: Weights, detail: jax.Array, noise: jax.Array, missing: jax.Array, weight: jax.Array) -> jax.Array:
+def _loss(network: Network, detail: Tensor, noise: Tensor, missing: Tensor, weight: Tensor) -> Tensor:
     """Mean of the logarithm of the patches' errors on a display: easy and hard ones count alike, as in a mean PSNR."""
-    error = (correction(weights, detail, noise) - missing) * weight
-    return jnp.mean(jnp.log(jnp.mean(error**2, axis=(1, 2, 3)) + _NEGLIGIBLE))
-
-
-State = tuple[Weights, Weights, Weights]
-
-
-@jax.jit
-def _step(state: State, average: Weights, batch: Batch, rate: jax.Array, step: jax.Array) -> tuple[State, Weights]:
-    """Take one step of Adam (Kingma and Ba, 2015), and follow the weights' average."""
-    weights, mean, square = state
-    slope = jax.grad(_loss)(weights, *(part.astype(jnp.float32) for part in batch))
-    mean = jax.tree.map(lambda old, new: _FIRST * old + (1 - _FIRST) * new, mean, slope)
-    square = jax.tree.map(lambda old, new: _SECOND * old + (1 - _SECOND) * new**2, square, slope)
-    one, two = 1 - _FIRST**step, 1 - _SECOND**step
-    weights = jax.tree.map(lambda w, m, s: w - rate * (m / one) / (jnp.sqrt(s / two) + _TINY), weights, mean, square)
-    keep = jnp.minimum(_AVERAGED, step / (step + 10))
-    return (weights, mean, square), jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, average, weights)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = network(detail, noise)
+    squares = ((found.float() - missing) * weight).square().mean(dim=(1, 2, 3))
+    return torch.log(squares + _NEGLIGIBLE).mean()
 
 
 class _Pool:
     """Examples that another process draws."""
 
-    def __init__(self, kernels: list[np.ndarray], data: Path, seed: int) -> None:
+    def __init__(self, kernels: list[np.ndarray], pictures: Pictures, seed: int) -> None:
         context = multiprocessing.get_context("spawn")
-        self._queue = context.Queue(64)
-        self._processes = [
-            context.Process(target=_draw, args=(kernels, data, seed + 100 + i, self._queue), daemon=True)
-            for i in range(_DRAWERS)
-        ]
-        for process in self._processes:
-            process.start()
+        self._queue: multiprocessing.Queue[Batch] = context.Queue(64)
+        self._process = context.Process(target=_draw, args=(kernels, pictures, seed, self._queue), daemon=True)
+        self._process.start()
         self._examples: list[Batch] = []
         self.drawn = 0
-        while len(self._examples) < 100:
+        while len(self._examples) < 200:
             self._take(wait=True)
 
     def _take(self, wait: bool) -> None:
@@ -129,33 +105,19 @@ class _Pool:
             self.drawn += 1
 
     def batch(self, rng: np.random.Generator) -> Batch:
-        """Return patches of drawn examples."""
+        """Return patches of drawn examples, in the order examples, channels, rows, columns."""
         self._take(wait=False)
-        chosen = rng.integers(len(self._examples), size=_BATCH // _PER_EXAMPLE)
-        patches = [patch(self._examples[index], rng) for index in chosen for _ in range(_PER_EXAMPLE)]
-        return tuple(np.stack(column) for column in zip(*patches, strict=True))
+        chosen = rng.integers(len(self._examples), size=_BATCH)
+        patches = [patch(self._examples[index], rng) for index in chosen]
+        return tuple(np.stack(column).transpose(0, 3, 1, 2) for column in zip(*patches, strict=True))
 
     def close(self) -> None:
         """Stop drawing."""
-        for process in self._processes:
-            process.terminate()
+        self._process.terminate()
 
 
-def patch(example: Batch, rng: np.random.Generator) -> Batch:
-    """Cut a patch, at whole places of the coarse level, and mirror it."""
-    y, x = (4 * int(rng.integers((INNER_PX - PATCH_PX) // 4 + 1)) for _ in range(2))
-    down, across = rng.choice([-1, 1], 2)
-    parts = []
-    for index, array in enumerate(example):
-        step = 2 if index == 1 else 1
-        cut = array[y // step : (y + PATCH_PX) // step, x // step : (x + PATCH_PX) // step]
-        parts.append(cut[::down, ::across])
-    return tuple(parts)
-
-
-def _draw(kernels: list[np.ndarray], data: Path, seed: int, queue: multiprocessing.Queue[Batch]) -> None:
-    os.nice(10)
-    examples, parent = Examples(_optics(kernels), data, seed), os.getppid()
+def _draw(kernels: list[np.ndarray], pictures: Pictures, seed: int, queue: multiprocessing.Queue[Batch]) -> None:
+    examples, parent = Examples(_optics(kernels), pictures, seed + 100), os.getppid()
     while os.getppid() == parent:  # Else the training was killed.
         e = examples.draw()
         queue.put(tuple(part.astype(np.float32) for part in (e.detail, e.noise, e.missing, e.weight)))
@@ -175,6 +137,13 @@ def _report(step: int, drawn: int, weights: Weights, checks: list[Example]) -> N
 _corrected = jax.jit(correction)
 
 
+def _read(file: Path | None) -> dict[str, np.ndarray] | None:
+    if file is None:
+        return None
+    with np.load(file, allow_pickle=False) as stored:
+        return {name: stored[name].astype(np.float32) for name in stored.files}
+
+
 def _write(weights: Weights, file: Path) -> None:
     np.savez(file, **{name: np.asarray(value, np.float16) for name, value in weights.items()})
 
@@ -183,8 +152,10 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0, help="how long to train")
     parser.add_argument("--out", type=Path, default=WEIGHTS_FILE, help="file of the weights")
-    parser.add_argument("--from", dest="start", type=Path, help="weights to go on from")
+    parser.add_argument("--from", dest="start", type=Path, help="weights to go on from, of a smaller network, too")
+    parser.add_argument("--rate", type=float, default=1.2e-3, help="the largest step; half as much to go on")
     parser.add_argument("--data", type=Path, default=_DATA, help="the shared folder with panoramas")
+    parser.add_argument("--root", type=Path, default=Path("/"), help="below which Debian's packages lie")
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args()
 
