@@ -86,6 +86,7 @@ def test_pictures_are_found_and_some_are_held_out(tmp_path: Path) -> None:
             cv2.imwrite(str(file), np.random.default_rng(1).integers(0, 255, (300, 1700, 3)).astype(np.uint8))
     own, judging = photographs(tmp_path, tmp_path, np.random.default_rng(0))
     assert len(own) + len(judging) == len(files(tmp_path))
+    assert len(own) >= 14
     assert len(judging) == 7
     assert all(p.ndim == 3 and p.min() >= 0 and p.max() <= 4 and max(p.shape) < 1600 for p in own + judging)
 

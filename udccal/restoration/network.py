@@ -35,12 +35,14 @@ INPUTS = 3 * COLOURS * _PLACES + BANDS
 SHARPER = np.float32(16)
 # Detail is what differs from the mean over this many px.
 DETAIL_PX = (31, 31)
-# How far the network looks, rows that it is given at once, and the coarse level's cell.
-REACH_PX, _BLOCK_ROWS, CELL_PX = 52, 256, 4
+# Rows that the network is given at once, and the coarse level's cell.
+_BLOCK_ROWS, CELL_PX = 256, 4
 # Ways round in which a picture can be shown: steps through its rows and columns.
 WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))
 # Channels at half and at a quarter of the resolution, and residual blocks there.
 _CHANNELS, BLOCKS = {"fine": 64, "coarse": 96}, {"fine": 3, "coarse": 4}
+# How far the network looks: two convolutions a block, one before and one after all, and a cell.
+REACH_PX = 2 * CELL_PX * BLOCKS["coarse"] + 2 * (2 * BLOCKS["fine"] + 2) + CELL_PX
 
 WEIGHTS_FILE = Path(__file__).with_name("network.npz")
 

@@ -37,10 +37,8 @@ def open_part(stamps: Stamps, state: State) -> np.ndarray:
 def seen_by(stamps: Stamps, state: State, seed: int) -> Stamps:
     """Stamps of what a state describes, with noise."""
     mean_e = expectation(stamps, state).mean_e.reshape(stamps.values_e.shape)
-    noise_e = np.sqrt(np.maximum(mean_e, 0.0) + stamps.read_e**2) * np.random.default_rng(seed).standard_normal(
-        mean_e.shape
-    )
-    return replace(stamps, values_e=mean_e + noise_e)
+    sigma_e = np.sqrt(np.maximum(mean_e, 0.0) + stamps.read_e**2)
+    return replace(stamps, values_e=mean_e + sigma_e * np.random.default_rng(seed).standard_normal(mean_e.shape))
 
 
 @in_float64

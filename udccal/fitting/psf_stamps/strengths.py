@@ -46,10 +46,8 @@ def settled(stamps: Stamps, state: State) -> State:
     Polynomials that the field does not need would only extrapolate the stars' noise to its edge. One degree more than
     the search allows may be needed there, and is part of what stars leave open.
     """
-    if len(state.field.mix) == 1:
-        return state
-    state = _with_degree(state)
-    if (free := _free(stamps, state)) is None:
+    wider = _with_degree(state)
+    if (free := _free(stamps, wider)) is None:
         return state
     precisions, ways = np.linalg.eigh(free.precision)
     precisions, score = np.maximum(precisions, 0.0), ways.T @ free.score
@@ -57,8 +55,9 @@ def settled(stamps: Stamps, state: State) -> State:
     priors = free.least * 4.0 ** np.arange(14)[:, None]
     evidence = (np.log(priors / (precisions + priors)) + score**2 / (precisions + priors)).sum(axis=1)
     best = float(priors[np.argmax(evidence), 0])
-    mix = np.concatenate([state.field.mix[:1], state.field.mix[1:] + free.mix(ways @ (score / (precisions + best)))])
-    return replace(state, field=replace(state.field, mix=mix), strength_precision=best)
+    mix = np.array(wider.field.mix)
+    mix[1:] += free.mix(ways @ (score / (precisions + best)))
+    return replace(wider, field=replace(wider.field, mix=mix), strength_precision=best)
 
 
 def _with_degree(state: State) -> State:
