@@ -32,7 +32,12 @@ def undefined(source: str, module: ModuleType) -> set[str]:
 @pytest.mark.medium
 @pytest.mark.parametrize("path", _MODULES, ids=str)
 def test_every_name_that_a_benchmark_reads_is_defined(path: Path) -> None:
-    module = importlib.import_module(".".join(path.with_suffix("").parts))
+    try:
+        module = importlib.import_module(".".join(path.with_suffix("").parts))
+    except ModuleNotFoundError as missing:
+        if missing.name != "torch":  # an extra that only training needs
+            raise
+        pytest.skip("pip install 'udccal[train]'")
     assert not undefined((_HERE.parents[1] / path).read_text(encoding="utf-8"), module)
 
 

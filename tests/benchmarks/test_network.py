@@ -92,7 +92,7 @@ def test_pictures_are_found_and_some_are_held_out(tmp_path: Path) -> None:
 
 
 def test_the_network_that_trains_is_the_one_that_restores() -> None:
-    torch = pytest.importorskip("torch", reason="pip install udccal[train]")
+    torch = pytest.importorskip("torch", reason="pip install 'udccal[train]'")
     from tests.benchmarks.network.torch_network import Network, to_weights
 
     rng = np.random.default_rng(3)
