@@ -152,16 +152,19 @@ def test_a_double_star_is_left_out() -> None:
 
 
 def test_missing_samples_and_clipped_cores() -> None:
-    stamps, _ = make(4)
-    values = stamps.values_e.copy()
-    values[np.random.default_rng(0).random(values.shape) < 0.05] = np.nan
-    clip = float(np.nanquantile(np.nanmax(values, axis=(1, 2)), 0.6))
-    values = np.where(values >= clip, clip, values)
-    result = fit_psf_stamps(replace(stamps, values_e=values, clip_e=clip), ORDERS)
-    relative, z = errors(result.term)
-    assert np.median(relative) < 0.01
-    assert 0.75 < z.std() < 1.25
-    assert next(d.value for d in result.diagnostics if d.name == "clipped_samples") > 10
+    every = []
+    for seed in (4, 5, 6):
+        stamps, _ = make(seed)
+        values = stamps.values_e.copy()
+        values[np.random.default_rng(0).random(values.shape) < 0.05] = np.nan
+        clip = float(np.nanquantile(np.nanmax(values, axis=(1, 2)), 0.6))
+        values = np.where(values >= clip, clip, values)
+        result = fit_psf_stamps(replace(stamps, values_e=values, clip_e=clip), ORDERS)
+        relative, z = errors(result.term)
+        every.append(z)
+        assert np.median(relative) < 0.01
+        assert next(d.value for d in result.diagnostics if d.name == "clipped_samples") > 10
+    assert 0.75 < np.std(every) < 1.25
 
 
 def test_clipping_that_is_not_told_is_seen() -> None:
@@ -224,7 +227,7 @@ def test_noise_that_is_given_too_large_is_told() -> None:
 
 
 def test_crowded_stamps_that_many_images_do_not_describe_are_a_poor_fit() -> None:
-    rules = StampsRules(steps_to_end=1, evidence=-1e9, most_images=1)
+    rules = StampsRules(steps_to_end=1, evidence=-1e9, evidence_of_nodes=-1e9, most_images=1)
     result = fit_psf_stamps(make(10, count=12)[0], Orders(1, 0, 1.0), rules=rules)
     assert result.status is FitStatus.POOR_FIT
     assert "leave out those that are crowded" in result.notes[0]
@@ -376,6 +379,14 @@ def test_far_wings_are_told_from_a_background(seed: int, background_e: float) ->
 
 
 @pytest.mark.medium
+def test_far_wings_stay_where_the_middle_changes() -> None:
+    """Astigmatism spreads the middle: with one pedestal all over the field, 8e-5 of the norm was missed (7 sigma)."""
+    data = drawn("astigmatism", 87074, 40, 21, 60494.6765421828, 1.284121981475889, varies=0.7855252626300332)
+    _, _, z = data.errors(fit_psf_stamps(data.stamps).term, 8)
+    assert np.quantile(np.abs(z), 0.999) < 4.0
+
+
+@pytest.mark.medium
 def test_stars_of_one_brightness_leave_far_wings_unknown() -> None:
     data = drawn("moffat", 3, 20, 15, 3e4, 5.0, (50.0, 0.0))
     light_e = data.light_e[:, None, None]
@@ -387,4 +398,4 @@ def test_stars_of_one_brightness_leave_far_wings_unknown() -> None:
 def pedestal_sigma(result: FitResult[StampsPsf]) -> float:
     """Stated error of the light that all samples of a stamp have in common."""
     assert result.posterior is not None
-    return float(result.posterior.sigma_of(lambda term: np.asarray(term.field.pedestal))[0])
+    return float(result.posterior.sigma_of(lambda term: np.asarray(term.field.pedestal).ravel())[0])

@@ -159,7 +159,7 @@ def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> Non
     matrix[0, :size, :size], matrix[0, size:, size:] = normal.dense, dense(normal.band)
     matrix[0, size:, :size], matrix[0, :size, size:] = normal.cross, normal.cross.T
     scale = np.diag(1 / state.size[0].ravel())
-    matrix[1, size - 9 : size, size - 9 : size] = np.diag(np.repeat(state.precisions[-4:-2], [8, 1]))
+    matrix[1, size - 14 : size, size - 14 : size] = np.diag(np.repeat(state.precisions[-5:-2], [8, 1, 5]))
     rough = laplacian(*state.size.shape[1:])[0].toarray() @ scale
     for term, (a, b) in enumerate(state.of_images[0]):
         image = np.s_[size + term :: 3]
@@ -191,7 +191,7 @@ def test_the_prior_is_that_of_its_eigenvalues() -> None:
     matrix, eigenvalues = laplacian(rows, columns)
     np.testing.assert_allclose(np.linalg.eigvalsh((matrix.T @ matrix).toarray()), np.sort(eigenvalues), atol=1e-9)
     scale = 1 / state.size[0].ravel()
-    volume, squares = float(np.log(state.precisions[-4:]) @ [8, 1, 1, 11]), 0.0
+    volume, squares = float(np.log(state.precisions[-5:]) @ [8, 1, 5, 1, 11]), 0.0
     for image, (a, b) in zip(state.field.nodes[0], state.of_images[0], strict=True):
         prior = (a * np.eye(len(scale)) + b * (matrix.T @ matrix).toarray()) * np.outer(scale, scale)
         volume += np.linalg.slogdet(prior)[1]

@@ -26,7 +26,7 @@ def _field() -> PsfField:
     warp, lateral, pedestal = (
         0.05 * _RNG.standard_normal((2, 5, 2, 2)),
         0.1 * np.ones((1, 2, 2)),
-        np.array([1e-3, 2e-3]),
+        np.array([[1e-3, 0.0, 5e-4], [2e-3, 1e-3, 0.0]]),
     )
     return PsfField(nodes, warp, lateral, _MIX, pedestal, 0.9)
 
@@ -70,7 +70,7 @@ def test_a_map_stretches_light_but_not_the_pixels() -> None:
         (warp - np.eye(2))[None, None].repeat(2, axis=1),
         np.zeros((0, 2, 2)),
         np.ones((1, 1)),
-        np.zeros(1),
+        np.zeros((1, 1)),
         0.5,
     )
     with jax.enable_x64(True):
@@ -92,7 +92,7 @@ def test_a_colour_has_its_own_image_map_and_place() -> None:
 
 def test_weights_of_nodes_give_the_values() -> None:
     # Without shear, since weights are products of two axes.
-    field = replace(_field(), warp=_field().warp * np.eye(2), pedestal=np.zeros(2))
+    field = replace(_field(), warp=_field().warp * np.eye(2), pedestal=np.zeros((2, 3)))
     with jax.enable_x64(True):
         seen = see(field, _UNIT, _CENTRE, _OFFSET, np.ones((5, 49), dtype=int))
     images = np.einsum("st,it,in->sn", polynomials(_UNIT, 1), _MIX, field.nodes[1].reshape(3, -1))
@@ -101,15 +101,15 @@ def test_weights_of_nodes_give_the_values() -> None:
 
 
 def test_changes_are_applied_where_their_vector_says() -> None:
-    field, zeros = _field(), np.zeros((30 + 40 + 4 + 2 + 1080, 1))
+    field, zeros = _field(), np.zeros((30 + 40 + 4 + 6 + 1080, 1))
     nothing = field.moved(Changes.of(field, 5, zeros))
     np.testing.assert_array_equal(nothing.nodes, field.nodes)
     one = zeros.copy()
     # The second image of the second colour's fourth node, behind five stars, two maps, a lateral colour, two pedestals.
-    one[30 + 40 + 4 + 2 + 540 + 3 * 3 + 1] = 1.0
-    one[30 + 40 + 4 + 1] = 3.0
+    one[30 + 40 + 4 + 6 + 540 + 3 * 3 + 1] = 1.0
+    one[30 + 40 + 4 + 4] = 3.0
     one[30 + 40] = 2.0
     moved = field.moved(Changes.of(field, 5, one))
     assert np.flatnonzero(moved.nodes - field.nodes).tolist() == [540 + 180 + 3]
     assert (moved.lateral - field.lateral).ravel().tolist() == [2.0, 0.0, 0.0, 0.0]
-    assert (moved.pedestal - field.pedestal).tolist() == [0.0, 3.0]
+    assert (moved.pedestal - field.pedestal).tolist() == [[0.0, 0.0, 0.0], [0.0, 3.0, 0.0]]

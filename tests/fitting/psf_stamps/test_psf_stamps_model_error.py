@@ -13,7 +13,7 @@ from udccal.fitting.psf_stamps.data import StampsRules
 from udccal.fitting.psf_stamps.field import Changes
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.psf_stamps.model_error import _larger, _surely_off, drawn, widen
-from udccal.fitting.psf_stamps.probability import faintest
+from udccal.fitting.psf_stamps.probability import expectation, faintest, with_error
 from udccal.fitting.psf_stamps.search import start
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
@@ -55,6 +55,17 @@ def test_positions_that_are_exchanged_are_told() -> None:
     exchanged = fit_psf_stamps(replace(stamps, position_px=np.roll(stamps.position_px, 7, axis=0)))
     assert exchanged.status is FitStatus.POOR_FIT
     assert "has its own position" in exchanged.notes[0]
+
+
+@in_float64
+def test_likelihood_is_smooth_although_the_model_error_is_not() -> None:
+    """Otherwise no step of a fit with a model error would be taken whole."""
+    stamps, rules = make(1)[0], StampsRules()
+    state = start(stamps, rules, 1)
+    state = with_error(stamps, state, 0.1 * state.size * np.random.default_rng(6).uniform(0.0, 1.0, state.size.shape))
+    moved = (replace(state, centre_px=state.centre_px + 0.002 * step) for step in range(20))
+    second = np.diff([expectation(stamps, there).log_likelihood for there in moved], 2)
+    assert np.ptp(second) < 0.1 * np.abs(second).max()
 
 
 @in_float64

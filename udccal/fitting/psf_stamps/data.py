@@ -144,6 +144,7 @@ class StampsRules:
         first_image: precisions before the data: of the first image (size, roughness), and of further ones.
         first_map, first_lateral: the same of maps of degrees 1 and 2, and of lateral colour.
         most_pedestal: part of a star's light that lies evenly all over a stamp: one standard deviation before the data.
+        first_pedestal: the same of its change over the field, at first.
         new_map: the same of higher degrees. They start nearly absent; one update makes them appear where the data
             support them.
         draws: numbers of posterior draws: for updates of precisions, and for error bars (5 % of a sigma).
@@ -156,6 +157,8 @@ class StampsRules:
         noise_off: part by which reduced chi-squared is below 1 where the noise given is too large.
         poor_above: reduced chi-squared above which the fit is poor; likewise squared errors of stars that were left
             out, in units of the expected ones.
+        least_predicted: a fit is poor where stars that were left out are off by more than this part of the change of
+            kernels over the field, and by more than is expected.
         poor_error: expected relative error of kernels above which the fit is poor.
     """
 
@@ -183,6 +186,7 @@ class StampsRules:
     first_map: float = 100.0
     first_lateral: float = 10.0
     most_pedestal: float = 0.1
+    first_pedestal: float = 0.01
     new_map: float = 3e4
     draws: tuple[int, int] = (16, 192)
     prior_doubt: float = 0.5
@@ -190,6 +194,7 @@ class StampsRules:
     inflate_above: float = 1.05
     noise_off: float = 0.1
     poor_above: float = 2.0
+    least_predicted: float = 0.7
     poor_error: float = 0.1
 
 

@@ -2,12 +2,13 @@
 
 With w the distance to the centre of the light, X the position, B_t(X) polynomials, and C_i(X) some mixtures of them,
 
-    psf(w; X) = p + 1 / |M(X)|  sum_i C_i(X) P_i(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t,    C_0 = 1.
+    psf(w; X) = p(X) + 1 / |M(X)|  sum_i C_i(X) P_i(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t,    C_0 = 1.
 
 The map M stretches, shears and turns an image over the field, with few numbers. Images P_i are cubic B-splines on a
 square grid of nodes and describe the rest. L, of polynomials too, is the distance of a colour's centre from the centre
 that all colours of a stamp have in common. The pedestal p is the same all over a stamp, as far wings of a psf nearly
-are. They differ from a background only by their growth with a star's light.
+are. They differ from a background only by their growth with a star's light. Over the field p changes, a polynomial of
+degree 2: neither a map that stretches images nor images that take up light from others leave far wings as they are.
 
 An image contains the mean over a pixel, and the map would stretch the pixel as well. Light that is stretched before
 pixels average it differs, to second order in the pixel's size a = 1 px, by (a^2 / 24) tr((M^-1 M^-T - 1) D) of the
@@ -47,7 +48,7 @@ class PsfField(eqx.Module):
         lateral: polynomials of lateral colour, in px (x, y), without the constant, which the images contain; of all
             planes except the reference, from which it is measured.
         mix: the polynomials' coefficients in the strength C of each image.
-        pedestal: light per pixel that all samples of a stamp have in common.
+        pedestal: polynomials of the light per pixel that all samples of a stamp have in common.
         spacing_px: between nodes.
     """
 
@@ -55,7 +56,7 @@ class PsfField(eqx.Module):
     warp: Float[Arrayish, "planes warp_terms 2 2"]
     lateral: Float[Arrayish, "other_planes lateral_terms 2"]
     mix: Float[Arrayish, "images terms"]
-    pedestal: Float[Arrayish, " planes"]
+    pedestal: Float[Arrayish, "planes pedestal_terms"]
     spacing_px: float = eqx.field(static=True)
 
     @property
@@ -89,6 +90,10 @@ class PsfField(eqx.Module):
         """Return L in px at positions scaled to about [-1, 1]."""
         every = np.insert(np.asarray(self.lateral), self.reference, 0.0, axis=0)
         return np.einsum("sm,pmi->spi", polynomials(unit, degree_of(1 + every.shape[1]))[:, 1:], every)
+
+    def pedestals(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars planes"]:
+        """Return p at positions scaled to about [-1, 1]."""
+        return polynomials(unit, degree_of(self.pedestal.shape[1])) @ np.transpose(self.pedestal)
 
     def moved(self, changes: Changes) -> PsfField:
         """Return the field after the first of these changes."""
@@ -175,7 +180,7 @@ def see(
     parts = ([_filled(part[at : at + 8], 0, 8) for part in by_star] for at in range(0, len(unit), 8))
     by_part = [response(*part, offset_px, *grid) for part in parts]
     seen = Seen(*(np.concatenate(part)[: len(unit)] for part in zip(*by_part, strict=True)))
-    common, jacobian = np.asarray(field.pedestal)[plane], seen.jacobian.copy()
+    common, jacobian = np.take_along_axis(field.pedestals(unit), plane, axis=1), seen.jacobian.copy()
     jacobian[..., 0] += common
     return seen._replace(value=seen.value + common, jacobian=jacobian)
 
@@ -202,8 +207,9 @@ def by_maps(
         index.append(lateral.reshape(field.lateral.shape)[plane - (plane > field.reference)].ravel())
         basis = polynomials(unit, degree_of(1 + field.lateral.shape[1]))[:, 1:]
         parts.append(scipy.sparse.kron(basis, one[:, 1:3]))
-    index.append(pedestal[[plane]])
-    parts.append(scipy.sparse.kron(np.ones((len(unit), 1)), one[:, [PEDESTAL]]))
+    index.append(pedestal.reshape(field.pedestal.shape)[plane])
+    basis = polynomials(unit, degree_of(field.pedestal.shape[1]))
+    parts.append(scipy.sparse.kron(basis, one[:, [PEDESTAL]]))
     return np.concatenate(index), scipy.sparse.csr_array(scipy.sparse.hstack(parts, format="csr"))
 
 

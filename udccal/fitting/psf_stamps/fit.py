@@ -19,7 +19,7 @@ from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
 from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_of_images, changes_of_light, see
-from udccal.fitting.psf_stamps.model_error import drawn, widen, without_error
+from udccal.fitting.psf_stamps.model_error import drawn, widen
 from udccal.fitting.psf_stamps.probability import LEAST, State, expectation
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
 from udccal.fitting.psf_stamps.slope import without_slope
@@ -265,7 +265,7 @@ def _report(
     warp = state.field.warp
     cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(warp.size))
     cov, names = block_diag(spread**2, cov), ["kernel_relative_l2", *_names(state)]
-    status, note = bad or _verdict(stamps, found, chi2_dof, float(size), rules)
+    status, note = bad or _verdict(stamps, found, chi2_dof, float(size), _spread(term), rules)
     return FitResult(
         name="psf",
         term=term,
@@ -292,29 +292,44 @@ def _report(
     )
 
 
-def _verdict(stamps: Stamps, found: Found, chi2_dof: float, size: float, rules: StampsRules) -> tuple[FitStatus, str]:
-    """Return the status, and what to do where it is a bad one; ``size`` is the expected relative error of kernels."""
+def _verdict(
+    stamps: Stamps, found: Found, chi2_dof: float, size: float, spread: float, rules: StampsRules
+) -> tuple[FitStatus, str]:
+    """Return the status, and what to do where it is a bad one.
+
+    Relative L2 norms: ``size`` is the expected error of kernels, ``spread`` their change over the stars.
+    """
     off = found.place.left_out_off
+    left_out = f"Stamps that were left out are off by {100 * off:.2g} %, where {100 * size:.2g} % are expected."
     if max(chi2_dof, _faint_scatter(stamps, found.place)) > rules.poor_above:
         return FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
     if off**2 > rules.poor_above * size**2:
-        told = f"Stamps that were left out are off by {100 * off:.2g} %, where {100 * size:.2g} % are expected."
-        return FitStatus.POOR_FIT, f"{told} Check that each stamp has its own position."
+        return FitStatus.POOR_FIT, f"{left_out} Check that each stamp has its own position."
     if not found.converged and len(found.place.field.mix) >= rules.most_images:
         told = f"{rules.most_images} images did not describe the stamps, and error bars do not hold."
         return FitStatus.POOR_FIT, f"{told} Check that each stamp holds one star; leave out those that are crowded."
     if size > rules.poor_error:
         told = f"Kernels are expected to be off by {100 * size:.2g} %."
         return FitStatus.POOR_FIT, f"{told} Give more or brighter stamps, large enough for the whole psf."
+    # Where positions are not the stars' own, those left out are as far off as if there were one psf for all.
+    if off > max(size, rules.least_predicted * spread):
+        return FitStatus.POOR_FIT, f"{left_out} Check that each stamp has its own position."
     if not found.converged:
         left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
         return FitStatus.NOT_CONVERGED, left
     return FitStatus.CONVERGED, ""
 
 
+def _spread(term: StampsPsf) -> float:
+    """Return by how much kernels at the stars differ from their mean, relative L2, root mean square."""
+    kernels = term.predict(term.star_px, term.field.reference)
+    mean = kernels.mean(axis=0)
+    return float(np.sqrt(((kernels - mean) ** 2).sum(axis=(1, 2)).mean() / (mean**2).sum()))
+
+
 def _faint_scatter(stamps: Stamps, state: State) -> float:
     """Return the mean square, by the median, of residuals where light is faint: errors of the psf hardly show there."""
-    plain = expectation(stamps, without_error(state))
+    plain = expectation(stamps, state.without_error())
     used = (plain.weight > 0) & (plain.mean_e <= np.quantile(plain.mean_e, 0.25))
     return robust_sigma((plain.residual * np.sqrt(plain.weight))[used]) ** 2
 
@@ -343,7 +358,7 @@ def _told(state: State) -> tuple[str, ...]:
 
 def _quiet(stamps: Stamps, state: State, dof: float, rules: StampsRules) -> tuple[str, ...]:
     """Return a note where samples scatter less than the noise given, the psf's own error apart."""
-    plain = expectation(stamps, without_error(state))
+    plain = expectation(stamps, state.without_error())
     chi2_dof = float((plain.residual**2 * plain.weight).sum()) / max(dof, 1.0)
     if chi2_dof > 1 - max(rules.noise_off, 6 * np.sqrt(2 / max(dof, 1.0))):
         return ()

@@ -29,14 +29,9 @@ Nodes = Float[np.ndarray, "planes grid_rows grid_columns"]
 Some = Float[np.ndarray, " some"]
 
 
-def without_error(state: State) -> State:
-    """Return the state with noise alone."""
-    return replace(state, model_error=np.zeros_like(state.size))
-
-
 def of_residuals(stamps: Stamps, state: State) -> Nodes:
     """Return the model error that a fit's own residuals show in most stars."""
-    seen = expectation(stamps, without_error(state))
+    seen = expectation(stamps, state.without_error())
     variance = np.divide(1.0, seen.weight, out=np.zeros_like(seen.weight), where=seen.weight > 0)
     return _shown(stamps, state, seen.residual**2, variance, 1.0, _typical)
 
@@ -55,7 +50,7 @@ def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> tuple
         found = laplace(stamps, replace(state, keep=state.keep & ~out[:, None]))
         draws = found.draws(rng, rules.draws[0])
         Changes.of(state.field, len(out), draws).stars[out] = 0.0
-        there = placed(stamps, without_error(state.shifted(found.mode)), out)
+        there = placed(stamps, state.shifted(found.mode).without_error(), out)
         seen = expectation(stamps, there)
         root = np.sqrt(seen.weight)[..., None]
         change = root * changes_of_samples(stamps, there.field, seen, draws)

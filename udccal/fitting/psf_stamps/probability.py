@@ -28,7 +28,7 @@ from udccal.fitting.psf_stamps.field import BACKGROUND, Changes, PsfField, Seen,
 
 LEAST = 2e-5  # size of the faintest light that the prior expects, relative to the peak
 ABSENT = 1e8  # precision of a term that is not there, relative to the kernel
-HELD = slice(-3, -1)  # precisions of the pedestals and of the backgrounds' mean
+HELD, FAR = [-4, -2], -3  # precisions of the means of pedestals and backgrounds, and of pedestals' change
 
 
 def envelope(
@@ -73,10 +73,13 @@ class State:
         centre_px: of the stars, from their middle samples.
         background_e: light per sample that is not the stars'.
         precisions: of the priors: (a, b) of images by colour and image; of maps by colour and degree, from 1; of
-            lateral colour likewise, of all colours but the reference; of pedestals; of backgrounds' mean and scatter.
+            lateral colour likewise, of all colours but the reference; of pedestals' mean and change over the field; of
+            backgrounds' mean and scatter.
         size: E of the priors, see ``envelope``.
         keep: True for samples that are not outliers.
-        model_error: what the model does not describe, in light per pixel at the nodes, which adds to the noise.
+        model_error: what the model does not describe, in light per pixel at the nodes.
+        error_e: the same in samples, which adds to their noise. It stays while places move: what is likely would jump
+            otherwise whenever a sample has another node next to it.
         margin: of the nodes' grid, where images other than the first are zero.
         left_out_off: least relative error of stars that were left out of the fit.
         strength_precision: of the prior of what is free of images' strengths.
@@ -90,6 +93,7 @@ class State:
     size: Float[np.ndarray, "planes grid_rows grid_columns"]
     keep: Bool[np.ndarray, "stars samples"]
     model_error: Float[np.ndarray, "planes grid_rows grid_columns"]
+    error_e: Float[np.ndarray, "stars samples"]
     margin: int = 0
     left_out_off: float = 0.0
     strength_precision: float = 0.0
@@ -167,7 +171,7 @@ class State:
         for own, like in zip(maps, (field.warp, field.lateral), strict=True):
             ends = np.cumsum(np.arange(2, degree_of(1 + like.shape[1]) + 1))
             parts += [every[one.ravel()] for of in own.reshape(like.shape) for one in np.split(of, ends) if one.size]
-        parts.append(every[pedestal.ravel()])
+        parts += [every[one.ravel()] for one in np.split(pedestal.reshape(field.pedestal.shape), [1], axis=1)]
         level, mean = every[numbers.stars[:, -planes:, 0].T.ravel()], np.full((1, stars), 1 / np.sqrt(stars))
         means = scipy.sparse.kron(np.eye(planes), mean)
         parts += [means @ level, level - means.T @ means @ level]
@@ -210,8 +214,13 @@ class State:
         precisions[: self.of_images.size] *= np.tile([ratio**2, ratio**-2], self.of_images.size // 2)
         field = replace(self.field, nodes=nodes, spacing_px=spacing_px)
         size = envelope(nodes[:, 0], spacing_px, faintest(stamps, self.light_e, self.background_e))
-        state = replace(self, field=field, precisions=precisions, size=size, model_error=np.zeros_like(size))
+        none = np.zeros_like(size), np.zeros_like(self.error_e)
+        state = replace(self, field=field, precisions=precisions, size=size, model_error=none[0], error_e=none[1])
         return state._confined(rules)
+
+    def without_error(self) -> State:
+        """Return the state with noise alone."""
+        return replace(self, model_error=np.zeros_like(self.size), error_e=np.zeros_like(self.error_e))
 
     def _confined(self, rules: StampsRules) -> State:
         """Return the state with further images in the middle of the grid, as far as the work requires."""
@@ -278,7 +287,7 @@ def expectation(stamps: Stamps, state: State) -> Weighted:
     _, rows, columns = state.size.shape
     node = seen.first + columns + 1 + rows * columns * stamps.plane
     light, background = (np.take_along_axis(own, stamps.plane, axis=1) for own in (state.light_e, state.background_e))
-    mean, read = light * seen.value + background, stamps.read_e**2 + (light * state.model_error.ravel()[node]) ** 2
+    mean, read = light * seen.value + background, stamps.read_e**2 + state.error_e**2
     # Expected light below zero has no shot noise.
     variance = np.maximum(mean, 0.0) + read
     residual, weight = stamps.value_e - mean, 1.0 / variance
@@ -297,6 +306,13 @@ def expectation(stamps: Stamps, state: State) -> Weighted:
     jacobian[..., BACKGROUND] = 1.0
     seen = seen._replace(down=light[..., None] * seen.down, jacobian=jacobian)
     return Weighted(seen, residual, weight, mean, node, float(likelihood[used].sum()))
+
+
+def with_error(stamps: Stamps, state: State, model_error: Float[np.ndarray, "planes rows columns"]) -> State:
+    """Return the state with a model error, in light per pixel at the nodes."""
+    light = np.take_along_axis(state.light_e, stamps.plane, axis=1)
+    error_e = light * model_error.ravel()[expectation(stamps, state).node]
+    return replace(state, model_error=model_error, error_e=error_e)
 
 
 def log_posterior(stamps: Stamps, state: State) -> float:

@@ -19,9 +19,10 @@ from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, backgrounds, centroids, edge_light, light_of
 from udccal.fitting.psf_stamps.equations import Laplace, laplace
 from udccal.fitting.psf_stamps.field import PsfField, polynomials, taps
-from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, resized, without_error
+from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, resized
 from udccal.fitting.psf_stamps.probability import (
     ABSENT,
+    FAR,
     HELD,
     State,
     envelope,
@@ -29,6 +30,7 @@ from udccal.fitting.psf_stamps.probability import (
     faintest,
     grid_size,
     log_posterior,
+    with_error,
 )
 from udccal.fitting.psf_stamps.strengths import settled
 from udccal.models.fields import polynomial_terms
@@ -42,10 +44,14 @@ Found = Solution[State, Laplace]
 @final
 @dataclass(frozen=True)
 class Evidence:
-    """The engine's problem: a step goes to the most probable state, and sets the precisions by empirical Bayes."""
+    """The engine's problem: a step goes to the most probable state, and sets the precisions by empirical Bayes.
+
+    Where ``follows``, the model error of samples is that of the nodes where a step has brought them.
+    """
 
     stamps: Stamps
     rules: StampsRules
+    follows: bool = False
     name: str = "psf field of stamps"
 
     def equations_at(self, place: State) -> Laplace:
@@ -63,6 +69,7 @@ class Evidence:
         ratio = np.clip(np.maximum(expected - left, 1e-6 * expected) / np.maximum(there, 1e-300), 1 / 30, 30.0)
         most = np.full_like(ratio, ABSENT)
         most[: place.of_images.size].reshape(place.of_images.shape)[:, 0, 0] = 1.0
+        most[FAR] *= self.stamps.values_e[0].size ** 2
         tuned = np.minimum(np.log(ratio), np.log(most / place.precisions))
         # Pedestal and background differ only where stars are of different brightness. Tuned, the precision of one would
         # rise until it is absent, and nothing would say that it could as well have been the other.
@@ -79,11 +86,12 @@ class Evidence:
         while True:
             there = place.shifted(part * step.shared)
             if part < _LEAST_PART or log_posterior(self.stamps, there) > least + 0.1 * part * step.gain:
+                there = with_error(self.stamps, there, there.model_error) if self.follows else there
                 return replace(there, precisions=place.precisions * np.exp(part * step.own[0]))
             part *= 0.5
 
 
-def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Found:
+def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int, follows: bool = False) -> Found:
     """Go to the most probable state nearby, in ``steps`` and one more at most; LinAlgError if singular at first."""
     # The last step's gain is more reliable than the next one's prediction, which ignores the precisions.
     evidence = max(rules.evidence, rules.evidence_of_nodes * float(state.kept.sum()))
@@ -95,7 +103,7 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
         first_damping=0.03,
         most_damping=0.1,
     )
-    problem = Evidence(stamps, rules)
+    problem = Evidence(stamps, rules, follows)
     found = minimise(problem, state, solver)
     if not np.isfinite(found.equations.cost):
         raise np.linalg.LinAlgError("singular at the start")
@@ -114,7 +122,7 @@ def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
         # Otherwise a star that was left out would be compared at its place and light of a coarse field.
         everything = placed(stamps, everything, out)
     # What the model does not describe, in most stars, is no hit.
-    seen = expectation(stamps, replace(everything, model_error=of_residuals(stamps, everything)))
+    seen = expectation(stamps, with_error(stamps, everything, of_residuals(stamps, everything)))
     # Clipped samples are not tested: their errors have a bound on one side.
     used = (seen.weight > 0) & ~stamps.clipped
     z = np.where(used, seen.residual * np.sqrt(seen.weight), 0.0)
@@ -148,20 +156,23 @@ def start(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
     image = np.exp(-0.5 * (y[:, None] ** 2 + x**2) * (spacing_px / WINDOW_PX) ** 2) + 1e-3
     nodes = np.tile(image / (image.sum() * spacing_px**2), (planes, 1, 1, 1))
     warp = np.zeros((planes, polynomial_terms(map_degree) - 1, 2, 2))
-    # Lateral colour of degree 2.
-    field = PsfField(nodes, warp, np.zeros((planes - 1, 5, 2)), np.ones((1, 1)), np.zeros(planes), spacing_px)
+    # Lateral colour and pedestals of degree 2.
+    lateral, pedestal = np.zeros((planes - 1, 5, 2)), np.zeros((planes, 6))
+    field = PsfField(nodes, warp, lateral, np.ones((1, 1)), pedestal, spacing_px)
     background_e = backgrounds(stamps)
     # A background may be all of the edges' light; one too faint for these to show may still be as large as the noise.
     squares = np.array([edge_light(stamps) ** 2, background_e.var(axis=0).mean()])
     expected = np.maximum(squares, stamps.read_e**2) * [len(stamps.unit), 1]
-    lateral, images = np.full(2 * planes - 2, rules.first_lateral), np.tile(rules.first_image[0], planes)
+    laterals, images = np.full(2 * planes - 2, rules.first_lateral), np.tile(rules.first_image[0], planes)
     maps = np.tile(([rules.first_map] * 2 + [rules.new_map] * map_degree)[:map_degree], planes)
-    pedestal = (stamps.values_e[0].size / rules.most_pedestal) ** 2
-    precisions = np.concatenate([images, maps, lateral, [pedestal], 1.0 / expected])
+    pedestals = (stamps.values_e[0].size / np.array([rules.most_pedestal, rules.first_pedestal])) ** 2
+    precisions = np.concatenate([images, maps, laterals, pedestals, 1.0 / expected])
     centre_px, light_e = centroids(stamps, background_e, WINDOW_PX), light_of(stamps, background_e)
     size = envelope(nodes[:, 0], spacing_px, faintest(stamps, light_e, background_e))
     keep = np.ones_like(stamps.known)
-    return State(field, centre_px, light_e, background_e, precisions, size, keep, np.zeros_like(size))
+    return State(
+        field, centre_px, light_e, background_e, precisions, size, keep, np.zeros_like(size), np.zeros(keep.shape)
+    )
 
 
 def coarse(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
@@ -169,11 +180,11 @@ def coarse(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
     state = start(stamps, rules, map_degree)
     for number, allowed in enumerate(rules.coarse):
         state = without_outliers(stamps, state, rules) if number > 1 else state
-        state = improve(stamps, replace(state, model_error=allowed * state.size), rules, 1).place
+        state = improve(stamps, with_error(stamps, state, allowed * state.size), rules, 1, follows=True).place
         # Images cannot make up for nodes too wide for the kernel.
         narrow = state.field.spacing_px == rules.spacings_px[0] and state.width_px < rules.narrow_px
         state = state.with_spacing(stamps, rules.spacings_px[-2] if narrow else state.field.spacing_px, rules)
-    return without_outliers(stamps, without_error(state), rules)
+    return without_outliers(stamps, state.without_error(), rules)
 
 
 def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
@@ -192,7 +203,7 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
     state = best.fit.place if orders else _denser(stamps, best.fit.place, rules)
     state = settled(stamps, without_outliers(stamps, state, rules))
     error, off = of_stars_left_out(stamps, state, rules)
-    state = replace(state, model_error=error, left_out_off=off)
+    state = replace(with_error(stamps, state, error), left_out_off=off)
     found = improve(stamps, state, rules, rules.steps_to_end)
     final = replace(best, fit=replace(found, place=resized(stamps, found.place, rules)))
     return Choice(final, (*(t for t in tried if t is not best), final))
@@ -203,21 +214,18 @@ def _denser(stamps: Stamps, state: State, rules: StampsRules) -> State:
 
     On the nodes that it prefers, a spline errs by up to 1 % at a sharp peak, at all places alike: four times what is
     stated. On denser ones the prior's smoothness holds what the data do not, so that error bars grow little. Several
-    images have more to hold: they stay where denser nodes hardly change what is expected of the stars, and where there
-    is no room for more, so that they would reach less far.
+    images have more to hold, and may have room for nodes in the middle only: they stay where denser nodes hardly change
+    what is expected of the stars, and where stars are less likely with them, as the images do not reach far enough.
     """
     denser = [one for one in rules.spacings_px if one < min(state.field.spacing_px, rules.most_spacing_px)]
     if not denser:
         return state
-    there = state.with_spacing(stamps, denser[0], rules)
-    if there.margin * denser[0] > state.margin * state.field.spacing_px:
-        return state
-    finer = improve(stamps, there, rules, rules.steps_to_compare).place
+    finer = improve(stamps, state.with_spacing(stamps, denser[0], rules), rules, rules.steps_to_compare).place
     if len(state.field.mix) == 1:
         return finer
     before, after = (expectation(stamps, one) for one in (state, finer))
     changed = float((before.weight * (after.mean_e - before.mean_e) ** 2).sum())
-    return finer if changed > rules.worth_finer else state
+    return finer if changed > rules.worth_finer and after.log_likelihood > before.log_likelihood else state
 
 
 def attempt(stamps: Stamps, found: Found, rules: StampsRules) -> Attempt[Found]:
