@@ -265,7 +265,7 @@ def _report(
     warp = state.field.warp
     cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(warp.size))
     cov, names = block_diag(spread**2, cov), ["kernel_relative_l2", *_names(state)]
-    status, note = bad or _verdict(stamps, found, chi2_dof, float(size), _spread(term), rules)
+    status, note = bad or _verdict(stamps, found, chi2_dof, float(size), term, rules)
     return FitResult(
         name="psf",
         term=term,
@@ -293,12 +293,9 @@ def _report(
 
 
 def _verdict(
-    stamps: Stamps, found: Found, chi2_dof: float, size: float, spread: float, rules: StampsRules
+    stamps: Stamps, found: Found, chi2_dof: float, size: float, term: StampsPsf, rules: StampsRules
 ) -> tuple[FitStatus, str]:
-    """Return the status, and what to do where it is a bad one.
-
-    Relative L2 norms: ``size`` is the expected error of kernels, ``spread`` their change over the stars.
-    """
+    """Return the status, and what to do where it is a bad one; ``size`` is the expected relative error of kernels."""
     off = found.place.left_out_off
     left_out = f"Stamps that were left out are off by {100 * off:.2g} %, where {100 * size:.2g} % are expected."
     if max(chi2_dof, _faint_scatter(stamps, found.place)) > rules.poor_above:
@@ -312,7 +309,7 @@ def _verdict(
         told = f"Kernels are expected to be off by {100 * size:.2g} %."
         return FitStatus.POOR_FIT, f"{told} Give more or brighter stamps, large enough for the whole psf."
     # Where positions are not the stars' own, those left out are as far off as if there were one psf for all.
-    if off > max(size, rules.least_predicted * spread):
+    if off > size and off > rules.least_predicted * _spread(term):
         return FitStatus.POOR_FIT, f"{left_out} Check that each stamp has its own position."
     if not found.converged:
         left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."

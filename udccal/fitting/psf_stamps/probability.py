@@ -214,8 +214,8 @@ class State:
         precisions[: self.of_images.size] *= np.tile([ratio**2, ratio**-2], self.of_images.size // 2)
         field = replace(self.field, nodes=nodes, spacing_px=spacing_px)
         size = envelope(nodes[:, 0], spacing_px, faintest(stamps, self.light_e, self.background_e))
-        none = np.zeros_like(size), np.zeros_like(self.error_e)
-        state = replace(self, field=field, precisions=precisions, size=size, model_error=none[0], error_e=none[1])
+        plain = self.without_error()
+        state = replace(plain, field=field, precisions=precisions, size=size, model_error=np.zeros_like(size))
         return state._confined(rules)
 
     def without_error(self) -> State:
