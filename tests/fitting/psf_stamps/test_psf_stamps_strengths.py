@@ -17,6 +17,8 @@ from udccal.fitting.psf_stamps.search import start
 from udccal.fitting.psf_stamps.strengths import drawn_strengths, settled
 from udccal.numerics import in_float64
 
+RULES = replace(StampsRules(), draws=(16, 2000))
+
 
 def with_strengths() -> tuple[Stamps, State]:
     """Stamps, and a field of two images with the strengths 1 and x."""
@@ -30,7 +32,7 @@ def with_strengths() -> tuple[Stamps, State]:
 
 def open_part(stamps: Stamps, state: State) -> np.ndarray:
     """What is free of 1 and x, a sigma of it."""
-    draws = drawn_strengths(stamps, state, 2000).reshape(2, 3, -1)
+    draws = drawn_strengths(stamps, state, RULES).reshape(2, 3, -1)
     return draws.std(axis=2) * np.sign(draws[..., draws[1, 2].argmax()])
 
 
@@ -48,7 +50,7 @@ def test_strengths_of_images_are_as_open_as_stars_leave_them() -> None:
     sigma = []
     for more in (1.0, 100.0):
         lit = replace(stamps, read_e=np.sqrt(more) * stamps.read_e)
-        draws = drawn_strengths(lit, replace(state, light_e=more * state.light_e), 2000).reshape(2, 3, -1)
+        draws = drawn_strengths(lit, replace(state, light_e=more * state.light_e), RULES).reshape(2, 3, -1)
         np.testing.assert_array_equal(draws[0], 0.0)
         at_stars = polynomials(stamps.unit, 1) @ draws[1]
         np.testing.assert_allclose(state.field.strengths(stamps.unit).T @ at_stars, 0.0, atol=1e-9)
@@ -66,7 +68,7 @@ def test_strengths_go_where_stars_have_them(term: int) -> None:
     truth = replace(found, field=replace(found.field, mix=found.field.mix + 0.1 * np.array([[0.0], [1.0]]) * free))
     moved = settled(seen_by(stamps, truth, 1), with_strengths()[1])
     at = polynomials(np.random.default_rng(5).uniform(-0.9, 0.9, (50, 2)), 2)
-    sigma = (at @ drawn_strengths(stamps, moved, 2000).reshape(2, 6, -1)[1]).std(axis=1)
+    sigma = (at @ drawn_strengths(stamps, moved, RULES).reshape(2, 6, -1)[1]).std(axis=1)
     before, after = (at @ (one.field.mix[1] - truth.field.mix[1]) for one in (found, moved))
     assert np.abs(after / sigma).max() < 4
     assert np.linalg.norm(after) < 0.1 * np.linalg.norm(before)
@@ -85,7 +87,7 @@ def test_one_image_has_no_strengths() -> None:
     stamps, rules = make(1)[0], StampsRules()
     state = start(stamps, rules, 1)
     assert settled(stamps, state) is state
-    assert not drawn_strengths(stamps, state, 3).any()
+    assert not drawn_strengths(stamps, state, RULES).any()
 
 
 @pytest.mark.medium

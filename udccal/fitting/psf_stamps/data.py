@@ -128,6 +128,7 @@ class StampsRules:
         spacings_px: spacings of nodes, the coarsest first.
         most_spacing_px: spacing below which fields of one image end.
         highest: largest degrees of the map and of the images' strengths.
+        strength_doubt: the likeliest width of strengths' prior is a guess: draws take a variance as much larger.
         image_beyond, images_at_once: new images are as many as this, of those whose significance is at least this part
             of the best one's.
         narrow_px: kernels whose Gaussian of the same area is narrower start with denser nodes.
@@ -171,6 +172,7 @@ class StampsRules:
     spacings_px: tuple[float, ...] = (1.0, 0.7, 0.5, 0.35)
     most_spacing_px: float = 0.7
     highest: tuple[int, int] = (4, 4)
+    strength_doubt: float = 4.0
     image_beyond: float = 0.1
     images_at_once: int = 3
     narrow_px: float = 0.7

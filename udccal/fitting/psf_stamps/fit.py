@@ -257,7 +257,7 @@ def _report(
     for _ in range(2):
         way = posterior.mode + posterior.solved(state.prior @ (state.vector + way))
     draws += way[:, None] * np.random.default_rng(3).standard_normal(rules.draws[1])
-    draws = np.concatenate([draws, inflation * drawn_strengths(stamps, state, rules.draws[1])])
+    draws = np.concatenate([draws, inflation * drawn_strengths(stamps, state, rules)])
     draws /= np.sqrt(rules.draws[1])
     term = _term(stamps, state, draws)
     # The expected error, then the maps' coefficients, named by colour, element and degrees in x and y.

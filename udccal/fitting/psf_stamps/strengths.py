@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cholesky, solve_triangular
 
-from udccal.fitting.psf_stamps.data import Stamps
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.field import degree_of, polynomials
 from udccal.fitting.psf_stamps.model_error import by_star
 from udccal.fitting.psf_stamps.probability import State, expectation
@@ -67,12 +67,12 @@ def _with_degree(state: State) -> State:
     return replace(state, field=replace(state.field, mix=np.pad(state.field.mix, ((0, 0), (0, more)))))
 
 
-def drawn_strengths(stamps: Stamps, state: State, count: int) -> Float[np.ndarray, "coefficients k"]:
+def drawn_strengths(stamps: Stamps, state: State, rules: StampsRules) -> Float[np.ndarray, "coefficients k"]:
     """Draw what stars leave open of strengths, in the order of ``Changes.mix``, by the prior that settled them."""
+    count = rules.draws[1]
     out = np.zeros((*np.shape(state.field.mix), count))
     if (free := _free(stamps, state)) is not None:
-        # The likeliest width of the prior is a guess: a wider one is nearly as likely.
-        prior = max(free.least, state.strength_precision / 4.0)
+        prior = max(free.least, state.strength_precision / rules.strength_doubt)
         precision = free.precision + prior * np.eye(len(free.precision))
         normal = np.random.default_rng(2).standard_normal((len(precision), count))
         out[1:] = free.mix(solve_triangular(cholesky(precision, lower=True), normal, lower=True, trans=1))
