@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.fit import StampsPsf
+from udccal.fitting.psf_stamps.term import StampsPsf
 
 SENSOR = np.array([2000.0, 1500.0])
 

@@ -18,7 +18,8 @@ import numpy as np
 
 import udccal
 from udccal.fitting.psf_stamps.data import Stamps, mosaic_channels
-from udccal.fitting.psf_stamps.fit import StampsPsf, fit_psf_stamps
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.result import FitResult
 
 # Of red, green and blue: how much wider than green, light, and lateral colour at the field's edge (px).

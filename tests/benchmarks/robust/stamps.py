@@ -9,7 +9,8 @@ import numpy as np
 from tests.benchmarks.robust.family import WORST_Z, Answer, Case, Family, Number, all_finite
 from tests.scenes.stamps import SHAPES, Drawn, drawn
 from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.fit import StampsPsf, fit_psf_stamps
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.result import FitResult
 
 _WRONG = ("hits", "positions", "missing", "lost", "noise")

@@ -12,9 +12,10 @@ from tests.scenes.stamps import drawn
 from tests.scenes.unchecked import checked_with
 from udccal.errors import FitError
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, mosaic_channels
-from udccal.fitting.psf_stamps.fit import StampsPsf, fit_psf_stamps
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.psf_stamps.search import Orders
 from udccal.fitting.psf_stamps.slope import without_slope
+from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.result import FitResult, FitStatus
 
 SENSOR = np.array([1000, 800])

@@ -9,7 +9,8 @@ import pytest
 
 from tests.fitting.psf_stamps.test_psf_stamps import SENSOR
 from tests.scenes.stamps import drawn
-from udccal.fitting.psf_stamps.fit import StampsPsf, fit_psf_stamps
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.result import FitResult
 
 

@@ -12,7 +12,7 @@ from tests.scenes.stamps import drawn as whole
 from udccal.fitting.psf_stamps.data import StampsRules
 from udccal.fitting.psf_stamps.field import Changes
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.model_error import _larger, _surely_off, drawn, widen
+from udccal.fitting.psf_stamps.model_error import _larger, _surely_off, add_model_error, widen
 from udccal.fitting.psf_stamps.probability import expectation, faintest, with_error
 from udccal.fitting.psf_stamps.search import start
 from udccal.numerics import in_float64
@@ -93,7 +93,9 @@ def test_light_beyond_the_reach_of_an_image_may_follow_that_within() -> None:
     of_images = np.full(state.of_images.shape, 1e12).ravel()
     precisions = np.concatenate([of_images, state.precisions[of_images.size :]])
     state = replace(state, field=replace(state.field, nodes=nodes), precisions=precisions)
-    changes = Changes.of(state.field, len(stamps.unit), drawn(state, state.vector.size, 2000))
+    draws = np.zeros((state.vector.size, 2000))
+    add_model_error(state, draws)
+    changes = Changes.of(state.field, len(stamps.unit), draws)
     relative = changes.nodes[0, 1] / nodes[0, 0, ..., None]
     beyond = ~state.kept[..., 1]
     np.testing.assert_allclose(relative[beyond].std(axis=1), 0.2, rtol=0.1)

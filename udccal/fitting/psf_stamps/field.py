@@ -217,7 +217,8 @@ def changes_of_images(
     field: PsfField, unit: Float[np.ndarray, "stars 2"], changes: Changes, plane: int
 ) -> Float[np.ndarray, "stars grid_rows grid_columns k"]:
     """Return changes of a colour's image at each star."""
-    images = np.tensordot(field.strengths(unit), changes.nodes[plane], axes=1)
+    # In the order of the vector: no copy of the nodes of all images is made.
+    images = np.moveaxis(field.strengths(unit) @ np.moveaxis(changes.nodes[plane], 0, 2), 2, 0)
     if changes.mix.size:
         strengths = np.tensordot(polynomials(unit, degree_of(field.mix.shape[1])), changes.mix, axes=(1, 1))
         images += np.einsum("stk,tyx->syxk", strengths, field.nodes[plane])

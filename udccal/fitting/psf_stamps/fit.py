@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import NamedTuple, final
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,171 +15,16 @@ from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
-from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
-from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_of_images, changes_of_light, see
-from udccal.fitting.psf_stamps.model_error import drawn, widen
-from udccal.fitting.psf_stamps.probability import LEAST, State, expectation
+from udccal.fitting.psf_stamps.model_error import add_model_error, widen
+from udccal.fitting.psf_stamps.probability import State, expectation
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
 from udccal.fitting.psf_stamps.slope import without_slope
 from udccal.fitting.psf_stamps.strengths import drawn_strengths
+from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
-
-
-class Kernels(NamedTuple):
-    """Kernels, model centres relative to theirs, light in the window; changes along the factor (relative for light)."""
-
-    value: Float[np.ndarray, "n pixels"]
-    centre_px: Float[np.ndarray, "n 2"]
-    total: Float[np.ndarray, " n"]
-    change: Float[np.ndarray, "n pixels k"]
-    centre_change: Float[np.ndarray, "n 2 k"]
-    total_change: Float[np.ndarray, "n k"]
-    jacobian: Float[np.ndarray, "n pixels 2"]
-
-
-class Sources(NamedTuple):
-    """A fit's stars in the term's convention: (x, y) from the middle sample, and light in the window by colour."""
-
-    place_px: Float[np.ndarray, "stars 2"]
-    place_sigma_px: Float[np.ndarray, "stars 2"]
-    light_e: Float[np.ndarray, "stars planes"]
-    light_sigma_e: Float[np.ndarray, "stars planes"]
-
-
-@final
-@dataclass(frozen=True)
-class StampsPsf:
-    """The psf field of stamps; every colour of a mosaic is a plane.
-
-    A kernel sums to 1 over its window. The centroid of the field's reference plane, under a Gaussian of ``window_px``,
-    is the kernel's centre; other planes keep their lateral colour relative to it.
-
-    Attributes:
-        field: of all colours.
-        factor: of the covariance of all unknowns, in the order of ``Changes``: draws of the posterior over the root of
-            their number, so that sigmas are known to 5 %. It includes the inflation by the misfit.
-        centre_px, half_px: positions scale as (p - centre) / half; beyond one half the field is extrapolated.
-        rows, columns: of kernels.
-        window_px: standard deviation of the Gaussian that weights centroids.
-        star_px, star_place_px, star_light_e: of the stars in the fit: middle samples on the sensor; the model's own
-            centres and light, which ``sources`` converts to the convention.
-    """
-
-    field: PsfField
-    factor: Float[np.ndarray, "unknowns k"]
-    centre_px: Float[np.ndarray, "2"]
-    half_px: Float[np.ndarray, "2"]
-    rows: int
-    columns: int
-    window_px: float
-    star_px: Float[np.ndarray, "stars 2"]
-    star_place_px: Float[np.ndarray, "stars 2"]
-    star_light_e: Float[np.ndarray, "stars planes"]
-
-    @in_float64
-    def predict(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
-        """Return kernels centred on the middle sample, at positions (x, y) on the sensor in px."""
-        parts = [kernels.value for kernels in replace(self, factor=self.factor[:, :0])._kernels(position_px, plane)]
-        return np.concatenate(parts).reshape(-1, self.rows, self.columns)
-
-    @in_float64
-    def sigma(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
-        """Return one standard deviation of every pixel of ``predict``."""
-        parts = []
-        for kernels in self._kernels(position_px, plane):
-            sigma, peak = np.linalg.norm(kernels.change, axis=2), np.abs(kernels.value).max(axis=1, keepdims=True)
-            # Beyond the nodes, nothing is known but that light is below the least that the prior expects.
-            parts.append(np.where(sigma > 0, sigma, LEAST * peak))
-        return np.concatenate(parts).reshape(-1, self.rows, self.columns)
-
-    @in_float64
-    def relative_l2(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n 2"]:
-        """Return the expected error of ``predict`` relative to the kernel's L2 norm: root mean square, and spread.
-
-        The error is the one after the best amplitude and shift, which are a matter of convention.
-        """
-        each = []
-        for kernels in self._kernels(position_px, plane):
-            free, _ = np.linalg.qr(np.concatenate([kernels.value[..., None], kernels.jacobian], axis=2))
-            change = kernels.change - free @ (free.transpose(0, 2, 1) @ kernels.change)
-            each.append(np.linalg.norm(change, axis=1) / np.linalg.norm(kernels.value, axis=1)[:, None])
-        every = np.concatenate(each)
-        return np.stack([np.linalg.norm(every, axis=1), np.sqrt(every.shape[1]) * every.std(axis=1)], axis=1)
-
-    @in_float64
-    def sources(self) -> Sources:
-        """Return places and light of the stars in the fit, with one standard deviation."""
-        own = Changes.of(self.field, len(self.star_px), self.factor).stars
-        light, relative = self.star_light_e.copy(), np.zeros_like(self.star_light_e)
-        for plane in range(light.shape[1]):
-            every = self._kernels(self.star_px, plane)
-            parts = zip(*((k.centre_px, k.total, k.centre_change, k.total_change) for k in every), strict=True)
-            centre, total, centre_change, total_change = (np.concatenate(part) for part in parts)
-            light[:, plane] *= total
-            relative[:, plane] = np.linalg.norm(own[:, 2 + plane] + total_change, axis=1)
-        # Kernels of all planes have the centre of the reference.
-        sigma_px = np.linalg.norm(own[:, :2] - centre_change, axis=2)
-        return Sources(self.star_place_px - centre, sigma_px, light, light * relative)
-
-    def changed(self, vector: Float[np.ndarray, " unknowns"]) -> StampsPsf:
-        """Return the term with changes of its unknowns, in the order of ``Changes``; a fit's posterior draws these."""
-        changes = Changes.of(self.field, len(self.star_px), vector[:, None])
-        field = self.field.moved(changes)
-        unknowns = len(self.factor) - changes.mix.size + field.nodes.size - self.field.nodes.size
-        return replace(
-            self,
-            field=field,
-            # What is drawn has no spread of its own.
-            factor=np.zeros((unknowns, 1)),
-            star_place_px=self.star_place_px + changes.stars[:, :2, 0],
-            star_light_e=self.star_light_e * np.exp(changes.stars[:, 2 : 2 + len(self.field.nodes), 0]),
-        )
-
-    def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
-        """Yield kernels with their changes, eight positions at a time: this size needs one compilation."""
-        grid = offsets(self.rows, self.columns)
-        window = grid * np.exp(-0.5 * (grid**2).sum(axis=1) / self.window_px**2)[:, None]
-        for start in range(0, len(position_px), 8):
-            unit = (np.asarray(position_px[start : start + 8], dtype=np.float64) - self.centre_px) / self.half_px
-            centre = self._centres(unit, window)
-            reference = _, own, by_centre = self._light(unit, centre, self.field.reference)
-            centre_change = -np.linalg.solve(window.T @ by_centre, window.T @ own)
-            same = plane == self.field.reference
-            light, change, jacobian = reference if same else self._light(unit, centre, plane)
-            change = change + jacobian @ centre_change
-            total = light.sum(axis=1)
-            value, relative = light / total[:, None], change.sum(axis=1) / total[:, None]
-            shape = change / total[:, None, None] - value[..., None] * relative[:, None]
-            yield Kernels(value, centre, total, shape, centre_change, relative, jacobian)
-
-    def _centres(
-        self, unit: Float[np.ndarray, "n 2"], window: Float[np.ndarray, "pixels 2"]
-    ) -> Float[np.ndarray, "n 2"]:
-        """Find the model's centre for which the reference plane's centroid is 0, by Newton's method."""
-        centre, grid = np.zeros_like(unit), offsets(self.rows, self.columns)
-        plane = np.full((len(unit), len(grid)), self.field.reference)
-        for _ in range(20):
-            seen = see(self.field, unit, centre, grid, plane)
-            off = window.T @ seen.value[..., None]
-            move = -np.linalg.solve(window.T @ seen.jacobian[..., 1:3], off)[..., 0]
-            centre = centre + np.clip(move, -0.5, 0.5)
-            if np.abs(move).max() < 1e-9:
-                break
-        return centre
-
-    def _light(
-        self, unit: Float[np.ndarray, "n 2"], centre: Float[np.ndarray, "n 2"], plane: int
-    ) -> tuple[Float[np.ndarray, "n pixels"], Float[np.ndarray, "n pixels k"], Float[np.ndarray, "n pixels 2"]]:
-        """Return the model's light, its changes along the columns of the factor, and its derivatives by the centre."""
-        field, grid, k = self.field, offsets(self.rows, self.columns), self.factor.shape[1]
-        changes = Changes.of(field, len(self.star_px), self.factor)
-        seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
-        index, matrix = by_maps(field, unit, plane)
-        images, used = changes_of_images(field, unit, changes, plane), np.arange(seen.value.size)
-        change = changes_of_light(seen, matrix @ changes.maps[index], images, used)
-        return seen.value, change.reshape(*seen.value.shape, k), seen.jacobian[..., 1:3]
 
 
 @in_float64
@@ -233,44 +77,63 @@ def _one_for_all(stamps: Stamps, rules: StampsRules, lowest: Orders) -> Choice[F
         ) from None
 
 
-def _report(
-    stamps: Stamps, chosen: Choice[Found], seed: int, rules: StampsRules, bad: tuple[FitStatus, str] | None
-) -> FitResult[StampsPsf]:
-    found, state = chosen.best.fit, chosen.best.fit.place
-    posterior, seen = laplace(stamps, state), expectation(stamps, state)
-    draws, used = posterior.draws(np.random.default_rng(seed), rules.draws[1]), seen.weight > 0
-    z = (seen.residual * np.sqrt(seen.weight))[used]
+class _Uncertainty(NamedTuple):
+    """Of all unknowns: the term's ``factor``, and the covariance of the maps' coefficients."""
+
+    factor: Float[np.ndarray, "unknowns k"]
+    map_cov: Float[np.ndarray, "n n"]
+    effective: float
+    chi2_dof: float
+    inflation: float
+
+
+def _uncertainty(
+    stamps: Stamps, state: State, chi2: float, samples: int, seed: int, rules: StampsRules
+) -> _Uncertainty:
+    posterior = laplace(stamps, state)
+    draws = posterior.draws(np.random.default_rng(seed), rules.draws[1])
     # All unknowns (except total light and common shift, which are held), less the part that the priors determine.
     held = float(state.precisions @ state.squares(draws))
     unknowns = int(state.kept.sum()) * state.light_e.shape[1] + state.maps + state.maps_from
     effective = unknowns - 2 - state.light_e.shape[1] - held
-    chi2_dof = float(z @ z) / max(z.size - effective, 1.0)
+    chi2_dof = chi2 / max(samples - effective, 1.0)
     inflation = float(np.sqrt(chi2_dof)) if chi2_dof > rules.inflate_above else 1.0
     # In place: of a field of ten images, each copy of the draws takes 0.1 GB.
     widen(state, draws, rules.prior_doubt)
     draws *= inflation
-    draws += drawn(state, *draws.shape)
+    add_model_error(state, draws)
     # The way that is left, and on to what the data alone prefer, is one more standard deviation: kernels with more
     # structure than the priors expect are smoothed by about as much. What is smoothed already pulls too little, so that
     # the way is taken again from its own end.
     way = np.zeros_like(state.vector)
     for _ in range(2):
         way = posterior.mode + posterior.solved(state.prior @ (state.vector + way))
-    draws += way[:, None] * np.random.default_rng(3).standard_normal(rules.draws[1])
+    for draw, size in zip(draws.T, np.random.default_rng(3).standard_normal(rules.draws[1]), strict=True):
+        draw += size * way
     draws = np.concatenate([draws, inflation * drawn_strengths(stamps, state, rules)])
     draws /= np.sqrt(rules.draws[1])
-    term = _term(stamps, state, draws)
+    map_cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(state.field.warp.size))
+    return _Uncertainty(draws, map_cov, effective, chi2_dof, inflation)
+
+
+def _report(
+    stamps: Stamps, chosen: Choice[Found], seed: int, rules: StampsRules, bad: tuple[FitStatus, str] | None
+) -> FitResult[StampsPsf]:
+    found, state = chosen.best.fit, chosen.best.fit.place
+    seen = expectation(stamps, state)
+    used = seen.weight > 0
+    z = (seen.residual * np.sqrt(seen.weight))[used]
+    factor, map_cov, effective, chi2_dof, inflation = _uncertainty(stamps, state, float(z @ z), z.size, seed, rules)
+    term = _term(stamps, state, factor)
     # The expected error, then the maps' coefficients, named by colour, element and degrees in x and y.
     size, spread = np.sqrt((term.relative_l2(term.star_px, term.field.reference) ** 2).mean(axis=0))
-    warp = state.field.warp
-    cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(warp.size))
-    cov, names = block_diag(spread**2, cov), ["kernel_relative_l2", *_names(state)]
+    cov, names = block_diag(spread**2, map_cov), ["kernel_relative_l2", *_names(state)]
     status, note = bad or _verdict(stamps, found, chi2_dof, float(size), term, rules)
     return FitResult(
         name="psf",
         term=term,
         status=status,
-        estimates=estimates("psf", names, np.concatenate([[size], warp.ravel()]), cov),
+        estimates=estimates("psf", names, np.concatenate([[size], state.field.warp.ravel()]), cov),
         cov=cov,
         chi2_dof=chi2_dof,
         samples=z.size,

@@ -201,10 +201,9 @@ def widen(state: State, draws: Float[np.ndarray, "unknowns k"], doubt: float) ->
     Changes.of(state.field, len(state.light_e), draws).nodes[:, 0] *= np.sqrt(1.0 + doubt * left)[..., None]
 
 
-def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknowns k"]:
-    """Draw what the model does not describe, as noise of the first images' nodes that gives kernels its model error."""
-    out = np.zeros((unknowns, count))
-    nodes = Changes.of(state.field, len(state.light_e), out).nodes
+def add_model_error(state: State, draws: Float[np.ndarray, "unknowns k"]) -> None:
+    """Add what the model does not describe to draws, in place: noise of nodes that gives kernels its model error."""
+    nodes, count = Changes.of(state.field, len(state.light_e), draws).nodes, draws.shape[1]
     # The mean sum of squared weights of a cubic B-spline is 0.479 along an axis.
     rng = np.random.default_rng(1)
     nodes[:, 0] += state.model_error[..., None] / 0.479 * rng.standard_normal((*state.size.shape, count))
@@ -218,4 +217,3 @@ def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknown
         nodes[:, image] += spread[..., None] / 0.479 * rng.standard_normal((*spread.shape, count))
         in_step = (total[:, image] / total[:, 0])[:, None, None] * first * left[image]
         nodes[:, image] += in_step[..., None] * rng.standard_normal(count)
-    return out
