@@ -13,6 +13,8 @@ from udccal.arguments import check_array, check_number, number_of
 from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import robust_sigma
+from udccal.fitting.psf_stamps.field import polynomials
+from udccal.models.fields import polynomial_terms
 from udccal.result import FitStatus
 
 _FARTHEST_PX = 2**20
@@ -128,6 +130,9 @@ class StampsRules:
         spacings_px: spacings of nodes, the coarsest first.
         most_spacing_px: spacing below which fields of one image end.
         highest: largest degrees of the map and of the images' strengths.
+        least_across: a mixture of polynomials of degree 1 that is smaller at the stars, RMS, is not determined: they
+            lie on a line. 0.5 is usual.
+        least_of_degree: the same of higher degrees, which are left out; at least 0.06 on drawn sets of 20 and more.
         strength_doubt: the likeliest width of strengths' prior is a guess: draws take a variance as much larger.
         image_beyond, images_at_once: new images are as many as this, of those whose significance is at least this part
             of the best one's.
@@ -172,6 +177,8 @@ class StampsRules:
     spacings_px: tuple[float, ...] = (1.0, 0.7, 0.5, 0.35)
     most_spacing_px: float = 0.7
     highest: tuple[int, int] = (4, 4)
+    least_across: float = 0.1
+    least_of_degree: float = 0.02
     strength_doubt: float = 4.0
     image_beyond: float = 0.1
     images_at_once: int = 3
@@ -299,7 +306,19 @@ def unusable(stamps: Stamps, rules: StampsRules) -> tuple[FitStatus, str] | None
     if clear < rules.fewest_unclipped:
         needed = f"{rules.fewest_unclipped} are needed."
         return FitStatus.SATURATED, f"{clear} stamps have a core that is not clipped or missing; {needed}"
+    quadratic = 2 * polynomial_terms(2) > len(stamps.unit) or determined(stamps, 2, rules.least_of_degree)
+    if not (quadratic and determined(stamps, 1, rules.least_across)):
+        told = (
+            "The stamps lie on a line or two, or at a few places, and tell nothing of the psf between and beside them."
+        )
+        return FitStatus.TOO_FEW_DATA, f"{told} One psf for all places is given. Spread them over the field."
     return None
+
+
+def determined(stamps: Stamps, degree: int, least: float) -> bool:
+    """Return whether no mixture of polynomials up to a degree is smaller at the stars than this, root mean square."""
+    every = polynomials(stamps.unit, degree)
+    return bool(np.linalg.svd(every / np.sqrt(len(every)), compute_uv=False).min() > least)
 
 
 def offsets(rows: int, columns: int) -> Float[np.ndarray, "samples 2"]:

@@ -16,7 +16,15 @@ from jaxtyping import Float
 from udccal.fitting.engine.least_squares import Solution, SolverRules, Step, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, choose
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.psf_stamps.data import Stamps, StampsRules, backgrounds, centroids, edge_light, light_of
+from udccal.fitting.psf_stamps.data import (
+    Stamps,
+    StampsRules,
+    backgrounds,
+    centroids,
+    determined,
+    edge_light,
+    light_of,
+)
 from udccal.fitting.psf_stamps.equations import Laplace, laplace
 from udccal.fitting.psf_stamps.field import PsfField, polynomials, taps
 from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, resized
@@ -189,8 +197,9 @@ def coarse(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
 
 def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
     """Search for the orders, unless they are given, and fit; raise LinAlgError when equations are singular."""
-    # Degrees have at most half as many polynomials as there are stars.
-    limit = max(d for d in range(9) if d == 0 or 2 * polynomial_terms(d) <= len(stamps.unit))
+    # Degrees have at most half as many polynomials as there are stars, and the stars tell each of them.
+    enough = [d for d in range(1, 9) if 2 * polynomial_terms(d) <= len(stamps.unit)]
+    limit = max((d for d in enough if determined(stamps, d, rules.least_of_degree)), default=0)
     map_degree, image_degree = (min(limit, highest) for highest in rules.highest)
     if orders:
         state = coarse(stamps, rules, orders.warp).with_spacing(stamps, orders.spacing_px, rules)

@@ -9,6 +9,7 @@ from typing import NamedTuple, final
 import numpy as np
 from jaxtyping import Float
 
+from udccal.errors import FitError
 from udccal.fitting.psf_stamps.data import offsets
 from udccal.fitting.psf_stamps.field import (
     OWN,
@@ -22,6 +23,9 @@ from udccal.fitting.psf_stamps.field import (
 )
 from udccal.fitting.psf_stamps.probability import LEAST
 from udccal.numerics import in_float64
+
+# Of a psf's area, over that at the stars: what a map does beyond is no measurement.
+_MOST_STRETCH = 3.0
 
 
 class Kernels(NamedTuple):
@@ -136,6 +140,7 @@ class StampsPsf:
 
     def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
         """Yield kernels with their changes, eight positions at a time: this size needs one compilation."""
+        self._check_like_stars(np.asarray(position_px, dtype=np.float64))
         grid = offsets(self.rows, self.columns)
         window = grid * np.exp(-0.5 * (grid**2).sum(axis=1) / self.window_px**2)[:, None]
         for start in range(0, len(position_px), 8):
@@ -150,6 +155,22 @@ class StampsPsf:
             value, relative = light / total[:, None], change.sum(axis=1) / total[:, None]
             shape = change / total[:, None, None] - value[..., None] * relative[:, None]
             yield Kernels(value, centre, total, shape, centre_change, relative, jacobian)
+
+    def _check_like_stars(self, position_px: Float[np.ndarray, "n 2"]) -> None:
+        """Refuse positions at which the map stretches far more or less than at any star: its polynomials run away."""
+        areas = [
+            np.linalg.det(self.field.maps((place - self.centre_px) / self.half_px)[:, self.field.reference])
+            for place in (position_px, self.star_px)
+        ]
+        low, high = areas[1].min() / _MOST_STRETCH, areas[1].max() * _MOST_STRETCH
+        off = ~((areas[0] > low) & (areas[0] < high))
+        if off.any():
+            (left, top), (right, bottom) = self.centre_px - self.half_px, self.centre_px + self.half_px
+            x, y = position_px[off][0]
+            raise FitError(
+                f"Expected positions where the psf is like that of the stars (x {left:.0f} to {right:.0f}, y {top:.0f} "
+                f"to {bottom:.0f} px), found ({x:.6g}, {y:.6g}). Ask for positions nearer to them, or add stars there."
+            )
 
     def _centres(
         self, unit: Float[np.ndarray, "n 2"], window: Float[np.ndarray, "pixels 2"]
