@@ -42,6 +42,13 @@ def test_arrays_of_another_kind_or_shape_are_refused(value: object, numbers: Num
         check_array(value, "it", numbers, ("rows", 3), "Give it.", FitError)
 
 
+@pytest.mark.parametrize("numbers", ["real numbers", "whole numbers"])
+def test_masked_entries_are_refused(numbers: Numbers) -> None:
+    with pytest.raises(FitError, match="Expected it without masked entries, found 1 of 3 masked"):
+        check_array(np.ma.masked_equal([1, 2, 3], 2), "it", numbers, (3,), "Give it.", FitError)
+    check_array(np.ma.masked_equal([1, 2, 3], 4), "it", numbers, (3,), "Give it.", FitError)
+
+
 def test_an_axis_with_a_name_has_any_length() -> None:
     for rows in (0, 5):
         check_array(np.zeros((rows, 3), np.uint8), "it", "8-bit values", ("rows", 3), "Give it.", FitError)

@@ -100,11 +100,23 @@ def check_array(
         error: kind of the error.
 
     Raises:
-        UdccalError: of that kind, with kind and shape of the array.
+        UdccalError: of that kind, with kind and shape of the array, or the number of its masked entries.
     """
+    check_unmasked(value, what, error)
     if not (isinstance(value, np.ndarray) and _holds(value, numbers, shape)):
         expected = f"Expected {what} as an array of {numbers}, {' x '.join(map(str, shape))}"
         raise error(f"{expected}, found {found_instead(value)}. {advice}")
+
+
+def check_unmasked(value: object, what: str, error: type[UdccalError]) -> None:
+    """Refuse a masked array with masked entries: most functions would take what lies under the mask for data.
+
+    Raises:
+        UdccalError: of the kind ``error``; ``what`` names the array.
+    """
+    if isinstance(value, np.ma.MaskedArray) and (masked := int(np.ma.count_masked(value))):
+        advice = "Fill them with NaN where NaN is accepted, or leave them out."
+        raise error(f"Expected {what} without masked entries, found {masked} of {value.size} masked. {advice}")
 
 
 def _holds(array: np.ndarray, numbers: Numbers, shape: tuple[int | str, ...]) -> bool:

@@ -132,6 +132,17 @@ def test_a_panel_picture_is_an_array_of_8_bits(toy_rig: RigDescription, picture:
         check_panel_picture(picture, toy_rig)
 
 
+def test_masked_entries_are_refused(toy_rig: RigDescription) -> None:
+    """What lies under a mask was restored as if nobody had masked it."""
+    frame, shown = (np.ma.masked_all(shape, kind) for shape, kind in (((96, 128), np.uint16), ((27, 48, 3), np.uint8)))
+    with pytest.raises(RestorationError, match="a frame without masked entries, found 12288 of 12288 masked"):
+        check_frame(frame, 0.01, toy_rig)
+    with pytest.raises(RestorationError, match="a panel picture without masked entries"):
+        check_panel_picture(shown, toy_rig)
+    with pytest.raises(RestorationError, match="picture without masked entries"):
+        deblur(np.ma.masked_all((96, 96, 3)), np.ones((1, 1, 3, 1, 1)), np.array([48.0]), np.array([48.0]))
+
+
 def test_one_frame_is_checked_before_the_profile_is_prepared(profile: Profile, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("udccal.restoration.one_frame.Restorer", None)
     small = np.zeros((10, 10), np.uint16)

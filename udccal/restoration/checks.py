@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from udccal.arguments import check_number, found_instead
+from udccal.arguments import check_number, check_unmasked, found_instead
 from udccal.errors import RestorationError, UdccalError
 from udccal.models.noise import scalar
 from udccal.profiles.profile import Profile
@@ -20,8 +20,9 @@ def real_array(value: object, what: str) -> np.ndarray:
     """Return an array, or lists of numbers as one, in single precision at least: whole numbers would wrap around.
 
     Raises:
-        RestorationError: when it does not hold real numbers; ``what`` names it.
+        RestorationError: when it does not hold real numbers, or some are masked; ``what`` names it.
     """
+    check_unmasked(value, what, RestorationError)
     try:
         found = np.asarray(value)
     except ValueError:  # lists of different lengths
@@ -52,8 +53,10 @@ def check_frame(mosaic: object, exposure_s: object, rig: RigDescription) -> None
         rig: the rig description.
 
     Raises:
-        RestorationError: when the type, size or range of the samples is another, or the exposure cannot be one.
+        RestorationError: when the type, size or range of the samples is another, some are masked, or the exposure
+            cannot be one.
     """
+    check_unmasked(mosaic, "a frame", RestorationError)
     camera = rig.camera
     if not isinstance(mosaic, np.ndarray) or mosaic.dtype != np.uint16 or mosaic.ndim != 2:
         raise RestorationError(
@@ -77,8 +80,9 @@ def check_panel_picture(picture: object, rig: RigDescription) -> None:
     """Refuse a panel picture that the rig's panel cannot have shown pixel for pixel; None is accepted.
 
     Raises:
-        RestorationError: when it is not 8-bit RGB of the panel's size.
+        RestorationError: when it is not 8-bit RGB of the panel's size, or some of it is masked.
     """
+    check_unmasked(picture, "a panel picture", RestorationError)
     expected = (rig.panel.rows, rig.panel.columns, 3)
     if picture is None:
         return

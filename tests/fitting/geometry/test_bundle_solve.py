@@ -147,5 +147,7 @@ def test_arrays_that_do_not_belong_together_are_refused() -> None:
         gather(board, [*image[:3], image[3][1:], *image[4:]])
     with pytest.raises(FitError, match="view 0"):
         gather(board, [view.T for view in image])
+    with pytest.raises(FitError, match="sigmas of view 1 without masked entries, found 1 of 96 masked"):
+        gather(board, [image[0], np.ma.masked_equal(image[1], image[1][5, 0]), *image[2:]])
     with pytest.raises(FitError, match="Expected numbers in view 0, found"):
         gather([board[0] + 1j, *board[1:]], image)

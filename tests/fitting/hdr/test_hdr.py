@@ -142,6 +142,15 @@ def test_exposures_that_cannot_be_are_refused(times: np.ndarray) -> None:
         merge_bracket(bracket(10.0, EXPOSURES, 7, (4, 4)), times, NOISE)
 
 
+def test_masked_codes_and_exposures_are_refused() -> None:
+    """What lies under a mask was merged as if nobody had masked it."""
+    codes = bracket(10.0, EXPOSURES, 7, (4, 4))
+    with pytest.raises(FitError, match="Expected frames without masked entries, found 1 of"):
+        merge_bracket(np.ma.masked_array(codes, np.arange(codes.size).reshape(codes.shape) == 3), EXPOSURES, NOISE)
+    with pytest.raises(FitError, match="Expected exposures without masked entries, found 1 of"):
+        merge_bracket(codes, np.ma.masked_equal(EXPOSURES, EXPOSURES[0]), NOISE)
+
+
 def test_a_hit_is_left_out_and_listed() -> None:
     rate = 2e3
     frames = bracket(rate, EXPOSURES, 8, (30, 40))

@@ -16,6 +16,7 @@ from udccal.fitting.noise.fit import fit_noise
 from udccal.result import FitStatus
 
 FRAME = np.full((32, 32), 100, np.uint16)
+MASKED = np.ma.masked_greater(FRAME, 0)
 
 
 @pytest.mark.parametrize(
@@ -30,6 +31,7 @@ FRAME = np.full((32, 32), 100, np.uint16)
         ([ExposureLevel(0.1, (FRAME, FRAME[:20]), (FRAME, FRAME))], None, "found"),
         ([ExposureLevel(0.1, (lambda: FRAME.astype(float), FRAME), (FRAME, FRAME))], None, "uint8 or uint16"),
         ([ExposureLevel(0.1, (lambda: "frame", FRAME), (FRAME, FRAME))], None, "found str"),
+        ([ExposureLevel(0.1, (MASKED, FRAME), (FRAME, FRAME))], None, "dark frame 0 .* without masked entries"),
         ([ExposureLevel(0.1, (FRAME[:4], FRAME[:4]), (FRAME, FRAME))], None, "samples a side"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))], SpatialStack(0.1, [FRAME], [FRAME]), "stack"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME + np.uint16(60000),) * 2)], None, "top_code"),

@@ -312,6 +312,8 @@ def test_a_field_that_changes_more_than_its_orders_is_told_and_held() -> None:
         ({"channel": np.full((30, 15, 15), 2)}, "channels 0, 1 and 2"),
         ({"channel": np.zeros((30, 15, 14), dtype=np.int64)}, "channels as an array of whole numbers, 30 x 15 x 15"),
         ({"values_e": np.zeros((30, 3, 15))}, "7 to 255 samples"),
+        ({"values_e": np.ma.masked_less(make(1)[0].values_e, 0.0)}, "stamps without masked entries, found"),
+        ({"position_px": np.ma.masked_less(make(1)[0].position_px, 99)}, "positions without masked entries, found"),
         ({"values_e": [[[0.0]]]}, "found list"),
         ({"values_e": None}, "found NoneType"),
         ({"values_e": np.zeros((30, 15, 15), dtype=complex)}, "found complex128"),

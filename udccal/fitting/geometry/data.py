@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from udccal.arguments import found_instead
+from udccal.arguments import check_unmasked, found_instead
 from udccal.arrangements import BoardSpec
 from udccal.cfa import cfa_named
 from udccal.errors import FitError
@@ -179,6 +179,8 @@ def gather(
     lost, notes = list[str](), list[str]()
     parts = {-1: (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))}
     for number, arrays in enumerate(zip(board, image, given, strict=True)):
+        for one in arrays:
+            check_unmasked(one, f"points and sigmas of view {number}", FitError)
         try:
             if any(np.iscomplexobj(one) for one in arrays):
                 raise TypeError("numpy would drop a part of complex numbers")

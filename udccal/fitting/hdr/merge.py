@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 from scipy.special import ndtr
 
-from udccal.arguments import found_instead
+from udccal.arguments import check_unmasked, found_instead
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.hdr.likelihood import (
@@ -121,6 +121,8 @@ def merge_bracket(
 
 def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposures"]:
     """The exposures, where frames and exposures are what they should be."""
+    check_unmasked(frames, "frames", FitError)
+    check_unmasked(exposures_s, "exposures", FitError)
     if not isinstance(frames, np.ndarray) or frames.dtype.kind not in "ui" or frames.ndim < 2:
         expected = "Expected frames as an array of whole codes, frame by frame"
         raise FitError(f"{expected}, found {found_instead(frames)}. Pass raw codes.")

@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from udccal.arguments import check_count, check_number, found_instead
+from udccal.arguments import check_count, check_number, check_unmasked, found_instead
 from udccal.errors import FitError, UdccalError
 from udccal.sessions.store import Session
 
@@ -83,6 +83,7 @@ class Averaged:
     def check(self, shape: tuple[int, ...]) -> None:
         """A FitError where it is not the mean of a number of frames of ``shape``."""
         mean = self.mean_DN
+        check_unmasked(mean, "an average of the stack", FitError)
         if not isinstance(mean, np.ndarray) or mean.dtype.kind != "f" or mean.shape != shape:
             found = f"float array of {shape} samples, as the frames of the pairs, found {found_instead(mean)}"
             raise FitError(f"Expected an average of the stack as {found}. Give the mean as it is, without rounding.")
@@ -190,6 +191,7 @@ def loaded(frame: Frame, name: str, shape: tuple[int, ...] = ()) -> Codes:
     except Exception as error:
         found = f"found {type(error).__name__}: {error}"
         raise FitError(f"Expected a function that loads {name}, {found}. Mend it, or give the array.") from error
+    check_unmasked(array, name, FitError)
     kind = array.dtype.newbyteorder("=") if isinstance(array, np.ndarray) else None
     if kind not in (np.uint8, np.uint16) or array.ndim != 2:
         expected = "Expected a frame as uint8 or uint16 array of rows x columns"
