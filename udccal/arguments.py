@@ -16,6 +16,8 @@ _KINDS: Final[dict[Numbers, str]] = {
     "truth values": "b",
     "8-bit values": "u",
 }
+# No sensor has pixels further out.
+_FARTHEST_PX: Final = 2**20
 _WHOLE = int | np.integer
 _NUMBER = _WHOLE | float | np.floating
 
@@ -106,6 +108,25 @@ def check_array(
     if not (isinstance(value, np.ndarray) and _holds(value, numbers, shape)):
         expected = f"Expected {what} as an array of {numbers}, {' x '.join(map(str, shape))}"
         raise error(f"{expected}, found {found_instead(value)}. {advice}")
+
+
+def check_positions(value: object, count: int | str, advice: str, error: type[UdccalError]) -> None:
+    """Refuse what are no positions (x, y) in px on a sensor, one per row.
+
+    Args:
+        value: what was given.
+        count: number of positions, or the name of any number.
+        advice: what to do, a sentence.
+        error: kind of the error.
+
+    Raises:
+        UdccalError: of that kind, with the shape, or the span of the positions.
+    """
+    check_array(value, "positions", "real numbers", (count, 2), advice, error)
+    found = np.asarray(value)
+    if not (np.abs(found) <= _FARTHEST_PX).all():
+        span = f"{found.min():g} to {found.max():g}"
+        raise error(f"Expected positions on the sensor of at most {_FARTHEST_PX} px, found {span}. {advice}")
 
 
 def check_unmasked(value: object, what: str, error: type[UdccalError]) -> None:

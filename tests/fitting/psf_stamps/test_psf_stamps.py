@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from dataclasses import replace
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -127,6 +128,25 @@ def test_kernels_sum_to_one_and_are_centred(fitted: FitResult[StampsPsf]) -> Non
     np.testing.assert_allclose(
         [(weight * u * predicted).sum(axis=(1, 2)), (weight * v * predicted).sum(axis=(1, 2))], 0, atol=1e-8
     )
+
+
+@pytest.mark.parametrize("asked", ["predict", "sigma", "relative_l2"])
+def test_a_term_answers_for_positions_on_a_sensor_alone(
+    fitted: FitResult[StampsPsf], asked: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They came out as NaN, or as tracebacks of numpy."""
+    # Without the tests' own check of types, which programs do not have.
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    of = getattr(fitted.term, asked)
+    assert of(np.zeros((0, 2))).shape == ((0, 2) if asked == "relative_l2" else (0, 15, 15))
+    with pytest.raises(FitError, match="positions on the sensor of at most 1048576 px, found nan to nan"):
+        of(np.full((1, 2), np.nan))
+    for wrong in ([[0.0, 0.0]], np.zeros(2), np.zeros((1, 3)), np.zeros(0)):
+        with pytest.raises(FitError, match="positions as an array of real numbers, n x 2, found"):
+            of(wrong)
+    for plane in (1, -1, "red", None):
+        with pytest.raises(FitError, match="a plane as a whole number from 0 to 0, found"):
+            of(np.zeros((1, 2)), plane)
 
 
 def test_cosmic_hits_are_listed_and_left_out() -> None:
@@ -338,6 +358,13 @@ def test_numbers_may_be_arrays_of_no_axes() -> None:
     checked_with(make(1)[0], {"read_e": np.array(4.0), "clip_e": np.array(np.inf)})
 
 
+def test_masked_arrays_without_masked_entries_are_plain_ones() -> None:
+    stamps, _ = make(1)
+    masked = replace(stamps, values_e=np.ma.masked_array(stamps.values_e))
+    assert {type(one) for one in (masked.known, masked.value_e)} == {np.ndarray}
+    np.testing.assert_array_equal(masked.value_e, stamps.value_e)
+
+
 @pytest.mark.parametrize("value_e", [np.nan, 0.0, -100.0])
 def test_stamps_without_light_are_refused(value_e: float) -> None:
     stamps, _ = make(1)
@@ -359,7 +386,24 @@ def test_what_are_no_stamps_is_refused() -> None:
         inspect.unwrap(fit_psf_stamps)(None)
 
 
-def test_three_stamps_are_too_few() -> None:
+@pytest.mark.parametrize("count", [0, 3])
+def test_fewer_than_four_stamps_are_too_few(count: int) -> None:
     stamps, _ = make(1)
-    with pytest.raises(FitError, match="at least 4 stamps"):
-        fit_psf_stamps(replace(stamps, values_e=stamps.values_e[:3], position_px=stamps.position_px[:3]))
+    with pytest.raises(FitError, match=f"at least 4 stamps, found {count}"):
+        fit_psf_stamps(replace(stamps, values_e=stamps.values_e[:count], position_px=stamps.position_px[:count]))
+
+
+def test_flat_stamps_have_no_slope() -> None:
+    """The equations of a slope had no light to divide by, and came out as a LinAlgError."""
+    flat = np.full((10, 15, 15), 7.0) + np.arange(10)[:, None, None]
+    stamps = Stamps(flat, np.arange(20).reshape(10, 2), 4.0)
+    assert without_slope(stamps) == (stamps, ())
+
+
+def test_the_slope_of_stamps_in_half_precision_is_that_of_double_precision() -> None:
+    """Sums of a stamp overflowed."""
+    stamps, _ = make(1)
+    tilted = (stamps.values_e / 4 + stamps.offset_px[:, 0].reshape(15, 15)).astype(np.float16)
+    half, double = (without_slope(replace(stamps, values_e=tilted.astype(kind))) for kind in ("f2", "f8"))
+    assert half[1] == double[1] != ()
+    np.testing.assert_array_equal(half[0].value_e, double[0].value_e)

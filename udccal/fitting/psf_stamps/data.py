@@ -9,15 +9,13 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.arguments import check_array, check_number, number_of
+from udccal.arguments import check_array, check_number, check_positions, number_of
 from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import robust_sigma
 from udccal.fitting.psf_stamps.field import polynomials
 from udccal.models.fields import polynomial_terms
 from udccal.result import FitStatus
-
-_FARTHEST_PX = 2**20
 
 
 @final
@@ -48,10 +46,7 @@ class Stamps:
         if self.values_e.size > 2**26:
             raise FitError(f"Expected at most {2**26} samples, found {self.values_e.size}. Use fewer stamps.")
         advice = "Give each stamp's middle sample."
-        check_array(self.position_px, "positions", "real numbers", (count, 2), advice, FitError)
-        if not (np.abs(self.position_px) <= _FARTHEST_PX).all():
-            span = f"{self.position_px.min():g} to {self.position_px.max():g}"
-            raise FitError(f"Expected positions on the sensor of at most {_FARTHEST_PX} px, found {span}. {advice}")
+        check_positions(self.position_px, count, advice, FitError)
         bounds, advice = (1e-6, 1e9), "Count the quantisation into it."
         check_number(number_of(self.read_e), "a read noise in e-", bounds, advice, FitError)
         advice = "Leave it out if nothing clips."
@@ -76,12 +71,13 @@ class Stamps:
     @cached_property
     def known(self) -> Bool[np.ndarray, "stars samples"]:
         """True for samples with a value; each stamp is row by row."""
-        return np.isfinite(self.values_e).reshape(len(self.values_e), -1)
+        return np.isfinite(np.asarray(self.values_e)).reshape(len(self.values_e), -1)
 
     @cached_property
     def value_e(self) -> Float[np.ndarray, "stars samples"]:
         """The samples in electrons, zero where nothing is known."""
-        return np.where(self.known, self.values_e.reshape(self.known.shape), 0.0)
+        # Sums of half precision would overflow.
+        return np.where(self.known, self.values_e.reshape(self.known.shape), 0.0).astype(np.float64, copy=False)
 
     @cached_property
     def clipped(self) -> Bool[np.ndarray, "stars samples"]:

@@ -48,8 +48,8 @@ def fit_psf_stamps(
     """
     rules = rules or StampsRules()
     check_kind(stamps, Stamps, "Cut one stamp about each star, and give udccal's Stamps.", FitError)
-    if len(stamps.unit) < 4:
-        raise FitError(f"Expected at least 4 stamps, found {len(stamps.unit)}. Cut more of them.")
+    if (count := len(stamps.values_e)) < 4:
+        raise FitError(f"Expected at least 4 stamps, found {count}. Cut more of them.")
     if (lit := int((stamps.value_e > stamps.read_e).any(axis=1).sum())) < 4:
         raise FitError(f"Expected light above the noise in at least 4 stamps, found it in {lit}. Check what was cut.")
     stamps, sloped = without_slope(stamps)

@@ -42,7 +42,8 @@ def _common(stamps: Stamps, seen: Bool[np.ndarray, "stars samples"]) -> Float[np
     if stars.sum() < _FEWEST:
         return np.zeros(2)
     slopes, light = slopes[stars], light[stars]
-    design = np.stack([np.ones(len(light)), light / np.median(light)], axis=1)
+    # Flat stamps have no light over their borders; any unit serves.
+    design = np.stack([np.ones(len(light)), light / (np.median(light) or 1.0)], axis=1)
     inverse = np.linalg.pinv(design.T @ design)
     fitted = inverse @ design.T @ slopes
     sigma = np.sqrt(inverse[0, 0] * ((slopes - design @ fitted) ** 2).sum(axis=0) / (len(light) - 2))

@@ -9,6 +9,7 @@ from typing import NamedTuple, final
 import numpy as np
 from jaxtyping import Float
 
+from udccal.arguments import check_count, check_positions
 from udccal.errors import FitError
 from udccal.fitting.psf_stamps.data import offsets
 from udccal.fitting.psf_stamps.field import (
@@ -81,9 +82,13 @@ class StampsPsf:
 
     @in_float64
     def predict(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
-        """Return kernels centred on the middle sample, at positions (x, y) on the sensor in px."""
+        """Return kernels centred on the middle sample, at positions (x, y) on the sensor in px.
+
+        Raises:
+            FitError: when positions are none on a sensor, or there is no such plane; so do ``sigma``, ``relative_l2``.
+        """
         parts = [kernels.value for kernels in replace(self, factor=self.factor[:, :0])._kernels(position_px, plane)]
-        return np.concatenate(parts).reshape(-1, self.rows, self.columns)
+        return np.concatenate([*parts, self._no_kernels]).reshape(-1, self.rows, self.columns)
 
     @in_float64
     def sigma(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
@@ -93,7 +98,7 @@ class StampsPsf:
             sigma, peak = np.linalg.norm(kernels.change, axis=2), np.abs(kernels.value).max(axis=1, keepdims=True)
             # Beyond the nodes, nothing is known but that light is below the least that the prior expects.
             parts.append(np.where(sigma > 0, sigma, LEAST * peak))
-        return np.concatenate(parts).reshape(-1, self.rows, self.columns)
+        return np.concatenate([*parts, self._no_kernels]).reshape(-1, self.rows, self.columns)
 
     @in_float64
     def relative_l2(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n 2"]:
@@ -101,7 +106,7 @@ class StampsPsf:
 
         The error is the one after the best amplitude and shift, which are a matter of convention.
         """
-        each = []
+        each = [np.zeros((0, self.factor.shape[1]))]
         for kernels in self._kernels(position_px, plane):
             free, _ = np.linalg.qr(np.concatenate([kernels.value[..., None], kernels.jacobian], axis=2))
             change = kernels.change - free @ (free.transpose(0, 2, 1) @ kernels.change)
@@ -138,8 +143,15 @@ class StampsPsf:
             star_light_e=self.star_light_e * np.exp(changes.stars[:, 2 : 2 + len(self.field.nodes), 0]),
         )
 
+    @property
+    def _no_kernels(self) -> Float[np.ndarray, "0 pixels"]:
+        """What there is at no position at all."""
+        return np.zeros((0, self.rows * self.columns))
+
     def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
         """Yield kernels with their changes, eight positions at a time: this size needs one compilation."""
+        check_positions(position_px, "n", "Give (x, y) in px for each kernel.", FitError)
+        check_count(plane, "a plane", 0, len(self.field.nodes) - 1, FitError)
         self._check_like_stars(np.asarray(position_px, dtype=np.float64))
         grid = offsets(self.rows, self.columns)
         window = grid * np.exp(-0.5 * (grid**2).sum(axis=1) / self.window_px**2)[:, None]
