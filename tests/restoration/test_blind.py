@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,14 @@ def test_what_replaces_a_sample_beside_clipped_ones_clips(toy_noise: Noise) -> N
     frame = in_DN(light() * wire)
     frame[18, 10] = 3969
     assert BlindSamples.of(wire, SHAPE, cfa_named("RGGB"), toy_noise).mended(frame, EXPOSURE_S)[20, 10] == 3969
+
+
+def test_samples_that_have_mended_a_frame_can_be_pickled(toy_noise: Noise) -> None:
+    frame = in_DN(light())
+    frame[20] = 64
+    blind = BlindSamples.of(None, SHAPE, cfa_named("RGGB"), toy_noise)
+    mended = blind.mended(frame, EXPOSURE_S)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(blind)).mended(frame, EXPOSURE_S), mended)
 
 
 def test_a_map_that_is_blind_all_over_is_left_alone(toy_noise: Noise) -> None:

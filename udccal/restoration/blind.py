@@ -113,6 +113,10 @@ class BlindSamples:
 
         return functools.lru_cache(maxsize=2)(found)
 
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out what is found anew: a cache cannot be pickled."""
+        return {name: value for name, value in vars(self).items() if name != "_found"}
+
 
 def dead_rows(
     mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, dark: float, cfa: Cfa
