@@ -273,7 +273,8 @@ class FitResult(Generic[Term]):
             an array of the shape and in the units of ``f(term)``.
 
         Raises:
-            FitError: when the fit failed, or when the result was read from a profile.
+            FitError: when the fit failed, the result was read from a profile, or ``f`` is no function or gives anything
+                but finite real numbers.
         """
         return self._whole_posterior().sigma_of(f)
 
@@ -291,7 +292,8 @@ class FitResult(Generic[Term]):
             the value, its sigma and its covariance, in the units of ``f(term)``.
 
         Raises:
-            FitError: when the fit failed, or when the result was read from a profile.
+            FitError: when the fit failed, the result was read from a profile, or ``f`` is no function or gives anything
+                but finite real numbers.
         """
         return self._whole_posterior().propagate(f)
 

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from typing import Any
+
+import jaxtyping
 import numpy as np
 import pytest
 from jaxtyping import Float
@@ -54,6 +57,35 @@ def test_a_propagated_function_has_value_sigma_and_covariance() -> None:
     assert number.sigma == pytest.approx(np.sqrt([0.02, 10.0] @ COV[:2, :2] @ [0.02, 10.0]), rel=1e-6)
     # Of a function that two correlated parameters enter, the sigma is not that of independent ones.
     assert abs(number.sigma / np.hypot(0.02 * 2.0, 10.0 * 1e-3) - 1) > 0.1
+
+
+@pytest.mark.parametrize("asked", ["sigma_of", "propagate"])
+@pytest.mark.parametrize(
+    ("f", "words"),
+    [
+        (lambda x: np.where(x > 9, x, np.nan), "finite numbers of the function, found 2 of 3 that are not"),
+        (lambda x: np.log(10.0 - x[0]), "finite numbers of the function, found 1 of 1"),
+        (lambda x: None, "real numbers of the function, found NoneType"),
+        (lambda x: "x", "real numbers of the function, found str"),
+        (lambda x: x + 1j, r"real numbers of the function, found complex128 of shape \(3,\)"),
+        (lambda x: [[1.0], [1.0, 2.0]], "real numbers of the function, found list"),
+        (7, "a function of the term, found int"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_what_gives_no_finite_numbers_is_refused(
+    f: Any, words: str, asked: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """NaN came out as a sigma of NaN, and the others as tracebacks of numpy."""
+    # Without the tests' own check of types, which programs do not have.
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    with pytest.raises(FitError, match=words):
+        getattr(_posterior(), asked)(f)
+
+
+def test_the_functions_own_error_passes() -> None:
+    with pytest.raises(ZeroDivisionError):
+        _posterior().sigma_of(lambda x: np.asarray(1 / int(0 * x[0])))
 
 
 def test_a_propagated_map_keeps_its_shape() -> None:

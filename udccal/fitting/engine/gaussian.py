@@ -9,6 +9,8 @@ from typing import Generic, TypeVar, final
 import numpy as np
 from jaxtyping import Float
 
+from udccal.arguments import found_instead
+from udccal.errors import FitError
 from udccal.numerics import in_float64
 from udccal.result import Propagated
 
@@ -110,8 +112,11 @@ class Posterior(Generic[Term]):
 
         Returns:
             an array of the shape and in the units of ``f(term)``.
+
+        Raises:
+            FitError: when ``f`` is no function, or gives anything but finite real numbers; so does ``propagate``.
         """
-        variance = np.zeros(np.shape(f(self.term)))
+        variance = np.zeros(_numbers_of(f, self.term).shape)
         for slope in self._slopes(f):
             variance += slope**2
         return np.asarray(np.sqrt(variance))
@@ -119,7 +124,7 @@ class Posterior(Generic[Term]):
     @in_float64
     def propagate(self, f: Callable[[Term], Float[np.ndarray, "*shape"]]) -> Propagated:
         """``f(term)`` with its covariance, to first order; unlike ``sigma_of`` it holds all derivatives together."""
-        value = np.asarray(f(self.term), dtype=np.float64)
+        value = _numbers_of(f, self.term)
         slopes = [slope.ravel() for slope in self._slopes(f)]
         return Propagated(value, np.stack(slopes, axis=1) if slopes else np.zeros((value.size, 0)))
 
@@ -128,8 +133,7 @@ class Posterior(Generic[Term]):
         for column in self.factor.T:
             if column.any():
                 up, down = (
-                    np.asarray(f(self.term_at(self.mean + step * column)), dtype=np.float64)
-                    for step in (_STEP_SIGMA, -_STEP_SIGMA)
+                    _numbers_of(f, self.term_at(self.mean + step * column)) for step in (_STEP_SIGMA, -_STEP_SIGMA)
                 )
                 yield (up - down) / (2 * _STEP_SIGMA)
 
@@ -138,6 +142,26 @@ class Posterior(Generic[Term]):
         """Terms drawn from the posterior."""
         steps = self.factor @ rng.standard_normal((self.factor.shape[1], count))
         return tuple(self.term_at(self.mean + step) for step in steps.T)
+
+
+def _numbers_of(f: Callable[[Term], object], term: Term) -> Float[np.ndarray, "*shape"]:
+    """What a caller's function makes of a term; a FitError where that is anything but finite real numbers."""
+    advice = "Give a function from a term to a number or an array."
+    if not callable(f):
+        raise FitError(f"Expected a function of the term, found {found_instead(f)}. {advice}")
+    made = f(term)
+    try:
+        found = np.asarray(made)
+    except ValueError:  # lists of different lengths
+        found = np.empty(0, dtype=object)
+    if found.dtype.kind not in "biuf":
+        raise FitError(f"Expected real numbers of the function, found {found_instead(made)}. {advice}")
+    if bad := int(np.count_nonzero(~np.isfinite(found))):
+        raise FitError(
+            f"Expected finite numbers of the function, found {bad} of {found.size} that are not. Leave out of its "
+            "array what has no value at the term or near it."
+        )
+    return found.astype(np.float64)
 
 
 def square_root(cov: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
