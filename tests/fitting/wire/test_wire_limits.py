@@ -33,7 +33,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.least_squares import LOG
 from udccal.fitting.wire import search
 from udccal.fitting.wire.data import WireData
-from udccal.fitting.wire.fit import fit_wire
+from udccal.fitting.wire.fit import fit_wire, unusable_flat
 from udccal.fitting.wire.parameters import WireRules
 from udccal.fitting.wire.search import scan_rows
 from udccal.models.wire import Wire, wire_map
@@ -165,6 +165,14 @@ def test_what_is_no_flat_is_refused(change: dict[str, Any], words: str) -> None:
     plain = np.ones((ROWS, COLUMNS))
     with pytest.raises(FitError, match=words):
         checked_with(WireData(plain, plain, geometry(), start(), PRNU), change)
+
+
+@pytest.mark.parametrize("side", [0, 1, 60])
+def test_a_flat_of_few_pixels_is_too_few_data(side: int) -> None:
+    """Sites without any pixel were told to be clipped."""
+    few = np.ones((side, side))
+    told = FitStatus.TOO_FEW_DATA, f"There are {side**2} pixels; use a larger region of the sensor."
+    assert unusable_flat(WireData(few, few, geometry(), start(), PRNU), WireRules()) == told
 
 
 @pytest.mark.medium

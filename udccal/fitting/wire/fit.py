@@ -124,6 +124,8 @@ def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows c
 
 def unusable_flat(data: WireData, rules: WireRules) -> tuple[FitStatus, str] | None:
     """Return why a flat cannot be fitted; None where it can be."""
+    if data.signal.size < rules.least_samples:
+        return FitStatus.TOO_FEW_DATA, f"There are {data.signal.size} pixels; use a larger region of the sensor."
     means = data.site_means
     if data.clipped > rules.most_clipped:
         return FitStatus.SATURATED, f"{100 * data.clipped:.1f} % of the flat is clipped."
@@ -131,8 +133,6 @@ def unusable_flat(data: WireData, rules: WireRules) -> tuple[FitStatus, str] | N
         return FitStatus.SATURATED, "All of a CFA site is clipped, or no number; expose shorter."
     if not all(means > 0):
         return FitStatus.TOO_DARK, "A CFA site has no light; check the lamp."
-    if data.signal.size < rules.least_samples:
-        return FitStatus.TOO_FEW_DATA, f"There are {data.signal.size} pixels; use a larger region of the sensor."
     worst = float(np.sqrt(flat_noise(data).variance(np.arange(means.size), np.ones(means.size)).max()))
     if worst > 1.0:
         note = f"A pixel's noise is {worst:.2g} of its signal. Average more frames, or expose longer."
