@@ -41,6 +41,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture
+def as_other_programs_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the checks of types that tests alone have."""
+    import jaxtyping
+
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture
 def emulated_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """Programs that the test starts see the camera that Basler's SDK emulates: 4096 x 4096 pixels."""
     from udccal.cameras.pylon_sdk.loading import load_sdk

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -55,6 +56,13 @@ def test_a_result_of_a_term_that_is_none_is_refused() -> None:
     assert profile.result("wire") is profile.wire
     with pytest.raises(udccal.UdccalError, match="one of noise, geometry, wire, psf, backscatter, found 'wires'"):
         profile.result("wires")
+
+
+@pytest.mark.usefixtures("as_other_programs_call")
+@pytest.mark.parametrize("seeds", [{"seed": "a"}, {"seed": None}, {"noise_seed": -1}])
+def test_a_seed_that_is_none_is_refused(tmp_path: Path, seeds: dict[str, Any]) -> None:
+    with pytest.raises(udccal.UdccalError, match="Expected a seed as a whole number from 0 to"):
+        udccal.simulate(udccal.load_rig(write_toy_rig(tmp_path)), **seeds)
 
 
 def test_a_capture_takes_names_of_terms_alone_and_leaves_no_session_for_others(tmp_path: Path) -> None:

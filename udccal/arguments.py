@@ -49,6 +49,16 @@ def check_kind(value: object, kind: type, advice: str, error: type[UdccalError])
         raise error(f"Expected a {kind.__name__}, found {_shown(value)}. {advice}")
 
 
+def check_optional(value: object, kind: type, error: type[UdccalError]) -> None:
+    """Refuse what is neither None, which stands for the default, nor an object of a class.
+
+    Raises:
+        UdccalError: of the kind ``error``, with the class of what was given.
+    """
+    if value is not None:
+        check_kind(value, kind, "Leave it out for the default.", error)
+
+
 def check_is_path(value: object, what: str, error: type[UdccalError]) -> None:
     """Refuse what is no path.
 
@@ -86,6 +96,15 @@ def check_count(value: object, what: str, least: int, most: int, error: type[Udc
         raise error(
             f"Expected {what} as a whole number from {least} to {most}, found {_shown(value)}. Give one of these."
         )
+
+
+def check_seed(value: object, error: type[UdccalError]) -> None:
+    """Refuse what cannot be the seed of random numbers.
+
+    Raises:
+        UdccalError: of the kind ``error``, when it is no whole number of 0 or more.
+    """
+    check_count(value, "a seed", 0, 2**63 - 1, error)
 
 
 def check_array(

@@ -67,6 +67,13 @@ def with_rig(profile: Profile, part: str, **changes: Any) -> Profile:
     )
 
 
+@pytest.mark.usefixtures("as_other_programs_call")
+def test_limits_of_another_kind_are_refused(toy: Profile) -> None:
+    for limits in ("a", {}):
+        with pytest.raises(ProfileError, match="Expected a DiffLimits, found"):
+            udccal.diff(toy, toy, limits)  # type: ignore[arg-type]
+
+
 def test_other_rigs_and_sensors_are_refused(measured: Profile) -> None:
     taken_by = measured.provenance.camera
     assert taken_by is not None

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -23,6 +22,7 @@ from udccal.profiles.store import write_profile
 from udccal.restoration import one_frame
 from udccal.restoration.checks import check_frame, check_panel_picture, check_raw_file
 from udccal.restoration.deblur import deblur
+from udccal.restoration.device.restorer import DeviceRestorer
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.scene_plan import Wish
@@ -33,12 +33,6 @@ from udccal.tiers import Tier
 
 pytestmark = pytest.mark.usefixtures("as_other_programs_call")
 RIGHT = Shot(make="M", cfa="RGGB")
-
-
-@pytest.fixture
-def as_other_programs_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the checks of types that tests alone have."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture
@@ -175,6 +169,21 @@ def test_options_that_cannot_be_are_refused(options: dict[str, Any], message: st
 def test_options_are_plan_options(profile: Profile, options: Any) -> None:
     with pytest.raises(RestorationError, match="Expected options as PlanOptions, found"):
         Restorer.from_profile(profile, Tier.fast, options)
+
+
+@pytest.mark.parametrize("without", [None, "wire", {"wirre"}, {"wire", 3}, 7])
+def test_stages_left_out_are_stages(profile: Profile, without: Any) -> None:
+    with pytest.raises(RestorationError, match="Expected a set of stages, of wire and backscatter, found"):
+        Restorer.from_profile(profile, Tier.preview, without=without)
+
+
+def test_what_is_no_restorer_or_picture_is_refused() -> None:
+    not_one: Any = "a"
+    with pytest.raises(RestorationError, match="Expected a Restorer, found 'a'"):
+        DeviceRestorer.of(not_one)
+    for picture in ([1.0], None, np.zeros((2, 2)), np.zeros((2, 2, 3), complex)):
+        with pytest.raises(RestorationError, match="a picture as an array of real numbers, rows x columns x 3, found"):
+            Tone(1.0).rgb8(picture)
 
 
 @pytest.mark.parametrize("exposure", [-1.0, np.nan, np.inf, True, "1"])

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
-from udccal.arguments import check_kind
+from udccal.arguments import check_kind, check_seed
 from udccal.arrangements import Stage
 from udccal.cameras.protocol import Camera
 from udccal.cameras.simulated import SimulatedCamera
@@ -65,4 +65,7 @@ def simulate(rig: RigDescription, seed: int = 0, noise_seed: int | None = None) 
         a context that opens the bench: camera, display, stage and clock. Simulated exposures take no real time.
     """
     check_kind(rig, RigDescription, "Read one by udccal.load_rig(name).", RigError)
+    check_seed(seed, RigError)
+    if noise_seed is not None:
+        check_seed(noise_seed, RigError)
     return simulated_bench(simulated_rig(rig, seed, noise_seed))

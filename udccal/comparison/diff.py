@@ -7,6 +7,7 @@ from typing import final
 
 import numpy as np
 
+from udccal.arguments import check_optional
 from udccal.comparison.advice import advice, better_fits
 from udccal.comparison.comparable import check_comparable
 from udccal.comparison.effects import effects_of
@@ -17,6 +18,7 @@ from udccal.comparison.maps import DifferenceMaps, difference_maps
 from udccal.comparison.movement import Movement, movement
 from udccal.comparison.picture import picture_loss
 from udccal.comparison.term_diff import VERDICTS, TermDiff, Verdict, not_captured, same_captures, term_diff
+from udccal.errors import ProfileError
 from udccal.profiles.profile import Profile
 
 FORMAT, VERSION = "udccal-diff", 1
@@ -72,6 +74,7 @@ def diff(a: Profile, b: Profile, limits: DiffLimits | None = None) -> ProfileDif
         ProfileError: when they are of different rigs or cameras, hold a covariance that cannot be one, or terms that
             give no finite numbers.
     """
+    check_optional(limits, DiffLimits, ProfileError)
     return compare(a, b, limits or DiffLimits())[0]
 
 

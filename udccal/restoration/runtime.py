@@ -38,7 +38,7 @@ from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
-from udccal.restoration.stages import Stage
+from udccal.restoration.stages import Stage, check_stages
 from udccal.restoration.tone import TONE_ADVICE, Tone
 from udccal.restoration.view import kept_view
 from udccal.rig import RigDescription
@@ -146,9 +146,10 @@ class Restorer:
 
         Raises:
             RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
-                finite, there is no such tier, options are no ``PlanOptions``, or ``keep`` is no path.
+                finite, there is no such tier or stage, options are no ``PlanOptions``, or ``keep`` is no path.
         """
         check_profile(profile)
+        check_stages(without)
         if keep is not None:
             check_is_path(keep, "a folder that keeps what is computed", RestorationError)
         options, tier, keep = checked_options(options), tier_named(tier), None if keep is None else Path(keep)

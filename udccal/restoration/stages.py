@@ -7,6 +7,7 @@ than 1 % to the variance of the error, 0.04 dB.
 from __future__ import annotations
 
 import enum
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar, Final, final
 
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from pydantic import ConfigDict
 
+from udccal.errors import RestorationError
 from udccal.models.backscatter import panel_light
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile
@@ -30,6 +32,18 @@ class Stage(enum.StrEnum):
 
     wire = "wire"
     backscatter = "backscatter"
+
+
+def check_stages(stages: object) -> None:
+    """Refuse what is no set of stages.
+
+    Raises:
+        RestorationError: when something else is among them; the message names the stages that there are.
+    """
+    if isinstance(stages, str) or not isinstance(stages, Collection) or not all(one in list(Stage) for one in stages):
+        raise RestorationError(
+            f"Expected a set of stages, of {' and '.join(Stage)}, found {stages!r:.80}. Name those to leave out."
+        )
 
 
 @final

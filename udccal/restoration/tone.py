@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from udccal.arguments import check_number
+from udccal.arguments import check_array, check_number
 from udccal.errors import RestorationError
 
 # A still picture's exposure brings this percentile of its light to this display-encoded value.
@@ -59,7 +59,13 @@ class Tone:
         return np.float32(self.exposure) * np.asarray(self.gains, dtype=np.float32)
 
     def rgb8(self, linear: Float32[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
-        """Return what a display shows, in 8 bits: ``to_rgb8(apply(linear))`` by a table, within 1 of 255."""
+        """Return what a display shows, in 8 bits: ``to_rgb8(apply(linear))`` by a table, within 1 of 255.
+
+        Raises:
+            RestorationError: when it is no picture of three colours.
+        """
+        advice = "Give a restored picture."
+        check_array(linear, "a picture", "real numbers", ("rows", "columns", 3), advice, RestorationError)
         # Rounded, and clipped at both ends; beyond the range of 32-bit integers the product would be 0.
         # Reading the picture for its largest value takes a third of the time of a bounded copy, which few need.
         most = 1e4 / max(float(self.scale().max()), 1e-30)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jaxtyping
 import numpy as np
 import pytest
 from jaxtyping import Float
@@ -73,12 +72,9 @@ def test_a_propagated_function_has_value_sigma_and_covariance() -> None:
     ],
 )
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_what_gives_no_finite_numbers_is_refused(
-    f: Any, words: str, asked: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("as_other_programs_call")
+def test_what_gives_no_finite_numbers_is_refused(f: Any, words: str, asked: str) -> None:
     """NaN came out as a sigma of NaN, and the others as tracebacks of numpy."""
-    # Without the tests' own check of types, which programs do not have.
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     with pytest.raises(FitError, match=words):
         getattr(_posterior(), asked)(f)
 

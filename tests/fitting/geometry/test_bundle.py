@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from hypothesis import strategies as st
 from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, calibrated, sight
 from udccal.board.charuco import board_points_mm
 from udccal.errors import FitError
-from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.geometry.bundle import GeometryRules
+from udccal.fitting.engine.gaussian import Posterior, Prior
+from udccal.fitting.geometry.bundle import GeometryRules, Intrinsics
 from udccal.fitting.geometry.calibrated import CalibratedViews
 from udccal.fitting.geometry.data import gather
 from udccal.fitting.geometry.fit import fit_geometry, projection_sigma_px
@@ -222,6 +223,24 @@ def test_views_need_no_common_corner() -> None:
     found = calibrated(board, image, SCENE.size, sigmas=sigma)
     assert found.status is FitStatus.CONVERGED
     assert np.abs(errors(found)).max() < 4
+
+
+@pytest.mark.usefixtures("as_other_programs_call")
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [({"start": "a"}, "Geometry"), ({"prior": {}}, "Prior"), ({"rules": None}, "GeometryRules")],
+)
+def test_arguments_of_another_kind_are_refused(change: dict[str, Any], kind: str) -> None:
+    with pytest.raises(FitError, match=f"Expected a {kind}, found"):
+        fit_geometry(*arrays()[:2], SCENE.size, **change)
+
+
+@pytest.mark.parametrize("pixels", [None, np.zeros(2), np.zeros((1, 3)), [[0.0, 0.0]]])
+@pytest.mark.usefixtures("as_other_programs_call")
+def test_pixels_are_positions(pixels: Any) -> None:
+    lens = Intrinsics.centred(300.0, (320, 240)).camera()
+    with pytest.raises(FitError, match="Expected positions as an array of real numbers, n x 2, found"):
+        projection_sigma_px(Posterior.from_cov(np.zeros(1), np.eye(1), lambda x: lens), pixels)
 
 
 @pytest.mark.parametrize("size", [(0, 0), (-320, -240), (320.0, 240.0), (320, 240, 3), None, 320, "320x240"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -149,6 +150,22 @@ def test_masked_codes_and_exposures_are_refused() -> None:
         merge_bracket(np.ma.masked_array(codes, np.arange(codes.size).reshape(codes.shape) == 3), EXPOSURES, NOISE)
     with pytest.raises(FitError, match="Expected exposures without masked entries, found 1 of"):
         merge_bracket(codes, np.ma.masked_equal(EXPOSURES, EXPOSURES[0]), NOISE)
+
+
+@pytest.mark.usefixtures("as_other_programs_call")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"exposures_s": EXPOSURES + 1j}, "positive exposure"),
+        ({"exposures_s": EXPOSURES.astype(str)}, "positive exposure"),
+        ({"noise": "a"}, "a noise model whose K_DN_per_e is a number"),
+        ({"rules": {}}, "Expected a HdrRules, found dict"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused(change: dict[str, Any], words: str) -> None:
+    right = {"frames": bracket(10.0, EXPOSURES, 7, (4, 4)), "exposures_s": EXPOSURES, "noise": NOISE}
+    with pytest.raises(FitError, match=words):
+        merge_bracket(**right | change)
 
 
 def test_a_hit_is_left_out_and_listed() -> None:

@@ -77,6 +77,7 @@ def test_an_exposure_that_is_a_frame_is_refused() -> None:
         ({"levels": (level for level in [])}, "sequence of exposure levels, found generator"),
         ({"levels": ExposureLevel(0.1)}, "sequence of exposure levels, found ExposureLevel"),
         ({"levels": [FRAME]}, "every level as an ExposureLevel, found uint16"),
+        ({"stack": "a"}, "Expected a SpatialStack, found 'a'"),
         ({"top_code": "4095"}, "top_code as a whole number from 1 to 65535, found '4095'"),
         ({"top_code": float("nan")}, "found nan"),
         ({"top_code": 1e9}, "found 1000000000.0"),

@@ -10,8 +10,11 @@ import pytest
 
 from tests.scenes.unchecked import checked_with, unchecked
 from udccal.errors import FitError
+from udccal.fitting.nominal import absent_wire, nominal_geometry
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots
+from udccal.fitting.psf.fit import fit_psf
 from udccal.result import FitStatus
+from udccal.rig import load_rig
 
 
 def shots(count: int = 4) -> Shots:
@@ -47,6 +50,32 @@ def spoilt(name: str, value: float) -> dict[str, np.ndarray]:
 def test_crops_that_cannot_be_are_refused(change: dict[str, Any], found: str) -> None:
     with pytest.raises(FitError, match=rf"^Expected .*, found {found}.*\. [A-Z].*\.$"):
         checked_with(shots(), change)
+
+
+@pytest.mark.usefixtures("as_other_programs_call")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rig": None}, "Expected a RigDescription, found NoneType"),
+        ({"geometry": None}, "Expected a Geometry, found NoneType"),
+        ({"wire": "a"}, "Expected a Wire, found 'a'"),
+        ({"rules": {}}, "Expected a PsfRules, found dict"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused(change: dict[str, Any], words: str) -> None:
+    rig = load_rig("lg55-reduced")
+    geometry = nominal_geometry(rig)
+    right = {"data": PsfData(None), "rig": rig, "geometry": geometry, "wire": absent_wire(rig, geometry)}
+    with pytest.raises(FitError, match=words):
+        fit_psf(**right | change)
+
+
+@pytest.mark.usefixtures("as_other_programs_call")
+def test_what_are_no_crops_or_counts_is_refused() -> None:
+    with pytest.raises(FitError, match="Expected a Shots, found 'a'"):
+        PsfData("a")  # type: ignore[arg-type]
+    with pytest.raises(FitError, match="pictures taken as a whole number from 0"):
+        PsfData(None, taken=None)  # type: ignore[arg-type]
 
 
 def test_rates_may_be_anything_where_nothing_is_known() -> None:

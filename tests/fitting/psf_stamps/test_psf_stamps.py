@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import replace
+from typing import Any
 
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -131,12 +131,9 @@ def test_kernels_sum_to_one_and_are_centred(fitted: FitResult[StampsPsf]) -> Non
 
 
 @pytest.mark.parametrize("asked", ["predict", "sigma", "relative_l2"])
-def test_a_term_answers_for_positions_on_a_sensor_alone(
-    fitted: FitResult[StampsPsf], asked: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("as_other_programs_call")
+def test_a_term_answers_for_positions_on_a_sensor_alone(fitted: FitResult[StampsPsf], asked: str) -> None:
     """They came out as NaN, or as tracebacks of numpy."""
-    # Without the tests' own check of types, which programs do not have.
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     of = getattr(fitted.term, asked)
     assert of(np.zeros((0, 2))).shape == ((0, 2) if asked == "relative_l2" else (0, 15, 15))
     with pytest.raises(FitError, match="positions on the sensor of at most 1048576 px, found nan to nan"):
@@ -384,6 +381,20 @@ def test_what_are_no_stamps_is_refused() -> None:
     # Without the tests' own check of types, which programs do not have.
     with pytest.raises(FitError, match="Expected a Stamps, found None"):
         inspect.unwrap(fit_psf_stamps)(None)
+
+
+@pytest.mark.usefixtures("as_other_programs_call")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"orders": "a"}, "Expected a Orders, found 'a'"),
+        ({"rules": {}}, "Expected a StampsRules, found dict"),
+        ({"seed": "a"}, "a seed as a whole number from 0 to"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(FitError, match=words):
+        fit_psf_stamps(make(1)[0], **change)
 
 
 @pytest.mark.parametrize("count", [0, 3])

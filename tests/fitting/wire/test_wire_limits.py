@@ -34,7 +34,7 @@ from udccal.fitting.engine.least_squares import LOG
 from udccal.fitting.wire import search
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire, unusable_flat
-from udccal.fitting.wire.parameters import WireRules
+from udccal.fitting.wire.parameters import WireRules, wire_start
 from udccal.fitting.wire.search import scan_rows
 from udccal.models.wire import Wire, wire_map
 from udccal.result import FitResult, FitStatus
@@ -157,7 +157,11 @@ def test_rows_that_noise_may_hide_are_in_the_error_bars(electrons: float) -> Non
         ({"PRNU1288": np.nan}, "PRNU1288 from 0 to 1, found nan"),
         ({"PRNU1288": -0.1}, "PRNU1288 from 0 to 1"),
         ({"clipped": np.inf}, "part of clipped pixels"),
-        ({"clip": np.nan}, "found NaN"),
+        ({"clip": np.nan}, "a signal from which frames clip from -inf to inf, found nan"),
+        ({"clip": None}, "a signal from which frames clip .* found NoneType"),
+        ({"geometry": None}, "Expected a Geometry, found NoneType"),
+        ({"start": "a"}, "Expected a WireStart, found 'a'"),
+        ({"cfa": ["RGGB"]}, "Expected one of the patterns"),
         ({"cfa": "WXYZ"}, "found 'WXYZ'"),
     ],
 )
@@ -165,6 +169,18 @@ def test_what_is_no_flat_is_refused(change: dict[str, Any], words: str) -> None:
     plain = np.ones((ROWS, COLUMNS))
     with pytest.raises(FitError, match=words):
         checked_with(WireData(plain, plain, geometry(), start(), PRNU), change)
+
+
+@pytest.mark.usefixtures("as_other_programs_call")
+def test_what_is_no_rule_start_or_rig_is_refused() -> None:
+    plain = np.ones((ROWS, COLUMNS))
+    data = WireData(plain, plain, geometry(), start(), PRNU)
+    with pytest.raises(FitError, match="Expected a WireRules, found dict"):
+        fit_wire(data, {})  # type: ignore[arg-type]
+    with pytest.raises(FitError, match="Expected a Wire, found 'a'"):
+        fit_wire(data, start="a")  # type: ignore[arg-type]
+    with pytest.raises(FitError, match="Expected a RigDescription, found NoneType"):
+        wire_start(None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("side", [0, 1, 60])

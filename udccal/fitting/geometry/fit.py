@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from udccal.arguments import check_kind, check_optional, check_positions
 from udccal.board.charuco import board_points_mm
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
@@ -69,6 +70,9 @@ def fit_geometry(
     Raises:
         FitError: when the arrays do not belong together.
     """
+    check_optional(start, Geometry, FitError)
+    check_optional(prior, Prior, FitError)
+    check_kind(rules, GeometryRules, "Leave it out for the default.", FitError)
     gathered = gather(board_points, image_points, sigmas, rules)
     check_picture(image_size, gathered.points)
     lens = start or Intrinsics.centred(float(max(image_size)), image_size).camera()
@@ -151,8 +155,10 @@ def projection_sigma_px(
         one sigma in px along x and along y, per pixel; errors as for ``FitResult.sigma_of``.
 
     Raises:
-        FitError: when the fitted distortion folds before a pixel, so that no direction appears there.
+        FitError: when the fitted distortion folds before a pixel, so that no direction appears there, or pixels are
+            none on a sensor.
     """
+    check_positions(pixels, "n", "Give (x, y) in px where directions appear.", FitError)
     directions, places = jax.jit(panel_directions)(result.term, pixels), jax.jit(project_directions)
     lost = ~(np.abs(np.asarray(places(result.term, directions)) - pixels).max(axis=1) < _ROUNDING_PX)
     if lost.any():

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 from scipy.special import ndtr
 
-from udccal.arguments import check_unmasked, found_instead
+from udccal.arguments import check_optional, check_unmasked, found_instead
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.hdr.likelihood import (
@@ -84,6 +84,7 @@ def merge_bracket(
         FitError: when frames are not codes or have no pixels, exposures are impossible or not as many as frames, or a
             number of the noise is impossible.
     """
+    check_optional(rules, HdrRules, FitError)
     rules = rules or HdrRules()
     times = _checked(frames, exposures_s)
     # Times in units of the longest: sums of their squares stay in single precision's range.
@@ -129,9 +130,10 @@ def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposur
     if len(frames) and not frames.size:
         raise FitError(f"Expected frames with pixels, found the shape {frames.shape}. Pass whole frames.")
     try:
-        times = np.asarray(exposures_s, dtype=np.float64)
-    except (TypeError, ValueError):
-        times = np.zeros(0)
+        given = np.asarray(exposures_s)
+    except ValueError:  # lists of different lengths
+        given = np.zeros(0)
+    times = given.astype(np.float64) if given.dtype.kind in "iuf" else np.zeros(0)
     # Single precision holds the rates of these exposures.
     if times.shape != (len(frames),) or not len(times) or not np.all((times >= 1e-9) & (times <= 1e6)):
         expected = f"Expected a positive exposure (1e-9 to 1e6 s) for each of the {len(frames)} frames of a bracket"

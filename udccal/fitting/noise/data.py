@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from udccal.arguments import check_count, check_number, check_unmasked, found_instead
+from udccal.arguments import check_count, check_number, check_optional, check_unmasked, found_instead
 from udccal.errors import FitError, UdccalError
 from udccal.sessions.store import Session
 
@@ -154,6 +154,7 @@ class NoiseData:
             for name in ("dark", "bright"):
                 if (found := _count(f"the {name} frames of level {index}", getattr(level, name))) not in (0, 2):
                     raise FitError(f"Expected two {name} frames in level {index} or none, found {found}.")
+        check_optional(self.stack, SpatialStack, FitError)
         if self.stack is None:
             return
         _check_exposure("the stack", self.stack.exposure_s, self.stack.photons)

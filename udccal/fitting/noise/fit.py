@@ -8,7 +8,7 @@ from itertools import compress
 import numpy as np
 from jaxtyping import Float
 
-from udccal.arguments import check_kind
+from udccal.arguments import check_optional
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
@@ -62,9 +62,8 @@ def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules |
             loaded, or an exposure is not a time.
         SessionError: when a file of the session is missing or damaged.
     """
-    for given, kind in ((nominal, Noise), (rules, NoiseRules)):
-        if given is not None:
-            check_kind(given, kind, "Leave it out for the default.", FitError)
+    check_optional(nominal, Noise, FitError)
+    check_optional(rules, NoiseRules, FitError)
     moments = reduced(data, rules or NoiseRules())
     nominal = nominal or _assumed(1.0, 0.0, moments.top_DN if moments else 4095.0)
     if moments:

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
-from udccal.arguments import Numbers, check_array, found_instead
+from udccal.arguments import Numbers, check_array, check_count, check_optional, found_instead
 from udccal.errors import FitError
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.engine.robust import Huber
@@ -277,6 +277,11 @@ class PsfData:
     clipped: int = 0
     doubted: tuple[str, ...] = ()
     unknown: int = 0
+
+    def __post_init__(self) -> None:
+        check_optional(self.shots, Shots, FitError)
+        for name in ("taken", "dark", "clipped", "unknown"):
+            check_count(getattr(self, name), f"pictures {name}", 0, 2**31, FitError)
 
     def unfit(self, rules: PsfRules) -> tuple[FitStatus, str] | None:
         """Return why these data cannot be fitted, or None."""

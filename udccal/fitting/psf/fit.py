@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from udccal.arguments import check_kind
+from udccal.arguments import check_kind, check_optional
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import SIGNIFICANT
@@ -84,6 +84,10 @@ def fit_psf(
         and a note instead of an exception.
     """
     check_kind(data, PsfData, "Give the crops as one.", FitError)
+    check_kind(rig, RigDescription, "Read one by udccal.load_rig(name).", FitError)
+    check_kind(geometry, Geometry, "Fit it first, or take nominal_geometry(rig).", FitError)
+    check_kind(wire, Wire, "Fit it first.", FitError)
+    check_optional(rules, PsfRules, FitError)
     rules = rules or PsfRules()
     data, start = data.known(rules), start_model(rig, geometry, wire, rules)
     unfit = data.unfit(rules)

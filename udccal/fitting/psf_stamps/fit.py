@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from udccal.arguments import check_kind
+from udccal.arguments import check_kind, check_optional, check_seed
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Choice
@@ -46,8 +46,11 @@ def fit_psf_stamps(
     Raises:
         FitError: when there are fewer than four stamps with light, or no psf describes any of them.
     """
-    rules = rules or StampsRules()
     check_kind(stamps, Stamps, "Cut one stamp about each star, and give udccal's Stamps.", FitError)
+    check_optional(orders, Orders, FitError)
+    check_optional(rules, StampsRules, FitError)
+    check_seed(seed, FitError)
+    rules = rules or StampsRules()
     if (count := len(stamps.values_e)) < 4:
         raise FitError(f"Expected at least 4 stamps, found {count}. Cut more of them.")
     if (lit := int((stamps.value_e > stamps.read_e).any(axis=1).sum())) < 4:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
 
-from udccal.arguments import check_array, check_number, number_of
+from udccal.arguments import check_array, check_kind, check_number, number_of
 from udccal.cfa import PATTERNS, cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import OutlierRule
@@ -77,9 +77,11 @@ class WireData:
         for name, number in (("PRNU1288", self.PRNU1288), ("part of clipped pixels", self.clipped)):
             check_number(number_of(number), f"a {name}", (0.0, 1.0), "Take it from the noise fit.", FitError)
         check_number(number_of(self.dark_sigma), "a sigma of the dark level", (0.0, np.inf), advice, FitError)
-        if np.isnan(self.clip):
-            raise FitError("Expected a signal from which frames clip, found NaN. Leave it out if nothing clips.")
-        if self.cfa not in PATTERNS:
+        check_kind(self.geometry, Geometry, "Fit one, or take nominal_geometry(rig).", FitError)
+        check_kind(self.start, WireStart, "Make one by wire_start(rig).", FitError)
+        bounds, advice = (-np.inf, np.inf), "Leave it out if nothing clips."
+        check_number(number_of(self.clip), "a signal from which frames clip", bounds, advice, FitError)
+        if not isinstance(self.cfa, str) or self.cfa not in PATTERNS:
             raise FitError(
                 f"Expected one of the patterns {', '.join(PATTERNS)}, found '{self.cfa}'. Name the sensor's."
             )

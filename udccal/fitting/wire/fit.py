@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from udccal.arguments import check_kind
+from udccal.arguments import check_kind, check_optional
 from udccal.errors import FitError
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
@@ -69,6 +69,8 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
         pixels, model error included. The status of a flat that cannot be used says why.
     """
     check_kind(data, WireData, "Give the average of a flat as one.", FitError)
+    check_optional(rules, WireRules, FitError)
+    check_optional(start, Wire, FitError)
     rules, shape = rules or WireRules(), data.signal.shape
     refused = unusable_flat(data, rules)
     if refused:

@@ -11,6 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from udccal.arguments import check_kind
+from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import SolverRules
 from udccal.models.geometry import Geometry
@@ -100,7 +102,12 @@ class WireStart:
 
 
 def wire_start(rig: RigDescription) -> WireStart:
-    """The start values of a wire fit by a rig's panel, lens and stand-off."""
+    """The start values of a wire fit by a rig's panel, lens and stand-off.
+
+    Raises:
+        FitError: when it is no rig description.
+    """
+    check_kind(rig, RigDescription, "Read one by udccal.load_rig(name).", FitError)
     panel, lens, standoff = rig.panel, rig.lens, rig.mounting.standoff_mm
     pitch, depth = panel.pitch_mm.value, panel.depth_mm
     pitch_tolerance = panel.pitch_mm.tolerance / pitch

@@ -124,6 +124,7 @@ class DeviceRestorer:
         Raises:
             RestorationError: when the restorer does not deblur, or its frames do not have whole cells of the pattern.
         """
+        check_kind(restorer, Restorer, "Prepare one by Restorer.load(path).", RestorationError)
         sharpener, camera, options = restorer.sharpener, restorer.rig.camera, restorer.options
         if sharpener is None:
             raise RestorationError(
