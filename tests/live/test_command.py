@@ -156,6 +156,27 @@ def test_a_run_that_cannot_begin_leaves_its_log_as_it_was(tmp_path: Path, monkey
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("earlier", "earlier")]
 
 
+def test_a_log_that_would_replace_what_the_run_reads_is_refused(
+    profile_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: pytest.fail("worked"))
+    panel, raw = tmp_path / "panel.png", write_raw_files(tmp_path / "raw", 1)
+    panel.write_bytes(b"a picture")
+    camera = LiveCamera("files", None, raw, 1e-3, 5.0, 0)
+    wanted = LiveRun(profile_folder, Tier.fast, camera, "shm:a", panel, None, "cpu", None, 1.0, Limits(), None)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    for log, words in (
+        (raw / "0.png", "apart from .*raw"),
+        (raw / "new.jsonl", "apart from .*raw"),
+        (panel, "apart from .*panel.png"),
+        (profile_folder / "profile.json", "inside the profile"),
+        (profile_folder / "log.jsonl", "inside the profile"),
+    ):
+        with pytest.raises(UdccalError, match=words):
+            run_live(Output(), replace(wanted, log=log))
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
 @pytest.mark.parametrize(
     ("kind", "changes", "message"),
     [

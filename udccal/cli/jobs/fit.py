@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
 from udccal.calibration import ORDER, Calibration, Foundation, calibrate
+from udccal.cli.jobs.log_file import check_log, log_file
 from udccal.cli.output import Output, StageTime
 from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.effort import FitEffort
-from udccal.errors import FitError, UdccalError
+from udccal.errors import FitError
 from udccal.fitting.engine.least_squares import LOG
 from udccal.io.links import refuse_links
 from udccal.io.out_folder import check_writable, storing_in
@@ -72,10 +73,12 @@ def fit_to_profile(
         SessionError: when the session is missing or damaged.
         FitError: when a term has no error bars; then the report is written and the profile is not.
         ProfileError: when something else is at the profile's path, or a profile whose terms cannot be kept.
-        UdccalError: when the profile's folder cannot be written to; this is found before any work.
+        UdccalError: when the profile's folder cannot be written to, or ``log`` is in a profile or a session; this is
+            found before any work.
     """
     check_replaceable(profile_path)
     check_writable(profile_path.parent)
+    check_log(log, session_path, profile_path)
     before = read_profile(profile_path) if terms else None
     parent = identity(profile_path).sha256 if terms else None
     keep_compilations()
@@ -115,13 +118,16 @@ def fit_to_profile(
 
 
 @final
-class _IterationLog(logging.FileHandler):
-    """Notes that a line could not be written, and lets the fits go on: they are worth more than their log."""
+class _Lines(logging.Handler):
+    """Gives each message of the solvers to what writes lines."""
 
-    cut_short = False
+    def __init__(self, write: Callable[[str], None]) -> None:
+        super().__init__()
+        self._write = write
+        self.setFormatter(logging.Formatter("%(relativeCreated)9.0f ms  %(message)s"))
 
-    def handleError(self, record: logging.LogRecord) -> None:
-        self.cut_short = True
+    def emit(self, record: logging.LogRecord) -> None:
+        self._write(self.format(record))
 
 
 @contextmanager
@@ -129,30 +135,18 @@ def _iterations_to(output: Output, path: Path | None) -> Iterator[None]:
     if path is None:
         yield
         return
-    try:
+    with storing_in(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         refuse_links(path.parent, path)
-        handler = _IterationLog(path, mode="w", encoding="utf-8")
-    except OSError as error:
-        raise UdccalError(
-            f"Expected to write the iterations to {path}, found that it cannot be written ({error.strerror}). "
-            "Give --log a file in a folder that can be written to."
-        ) from error
-    handler.setFormatter(logging.Formatter("%(relativeCreated)9.0f ms  %(message)s"))
-    level = LOG.level
-    LOG.addHandler(handler)
-    LOG.setLevel(logging.DEBUG)
-    try:
-        yield
-    finally:
-        LOG.setLevel(level)
-        LOG.removeHandler(handler)
+    with log_file(output, path, "iterations") as write:
+        handler, level = _Lines(write), LOG.level
+        LOG.addHandler(handler)
+        LOG.setLevel(logging.DEBUG)
         try:
-            handler.close()
-        except OSError:
-            handler.cut_short = True
-        if handler.cut_short:
-            output.say(f"The iterations in {path} are cut short: it could not be written to.")
+            yield
+        finally:
+            LOG.setLevel(level)
+            LOG.removeHandler(handler)
 
 
 def run_fits(

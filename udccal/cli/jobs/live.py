@@ -16,6 +16,7 @@ from typing import Final, Literal, final
 import jax
 
 from udccal.cli.jobs.live_cameras import LiveCamera
+from udccal.cli.jobs.log_file import check_log, log_file
 from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
@@ -79,11 +80,13 @@ def run_live(output: Output, wanted: LiveRun) -> None:
     Raises:
         UdccalError: when the run cannot begin, or a part of it fails.
     """
+    path = find_profile(wanted.profile)
+    check_log(wanted.log, path, wanted.camera.files, wanted.panel_picture)
     keep_compilations()
     device = _gpu() if wanted.device == "gpu" else None
     sink = _sink(wanted)
     hook = None if wanted.hook is None else TimedHook(load_hook(wanted.hook), wanted.hook_s)
-    path, stop = find_profile(wanted.profile), threading.Event()
+    stop = threading.Event()
 
     def prepared(profile: Profile) -> Restorer:
         return Restorer.from_profile(profile, wanted.tier, keep=prepared_folder())
@@ -156,40 +159,12 @@ def _ended_by_signals(stop: threading.Event) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _log(output: Output, path: Path | None) -> Iterator[Callable[[Figures], None]]:
-    """Yield what writes figures to a file, a line of JSON each. The run goes on where that fails: it is worth more.
-
-    What a file holds is replaced with the first figures: a run that cannot begin leaves it as it was.
-    """
+    """Yield what writes figures to a file, a line of JSON each."""
     if path is None:
         yield lambda figures: None
         return
-    try:
-        new = not path.exists()
-        stream = path.open("a", encoding="utf-8", buffering=1)
-    except OSError as error:
-        raise LiveError(f"Expected --log to name a file that can be written, found: {error}. Name another.") from error
-    begun = cut_short = False
-
-    def write(figures: Figures) -> None:
-        nonlocal begun, cut_short
-        if not begun:
-            begun = True
-            with contextlib.suppress(OSError):  # a pipe has no length
-                stream.truncate(0)
-        try:
-            print(json.dumps(asdict(figures)), file=stream)
-        except OSError:
-            cut_short = True
-
-    try:
-        yield write
-    finally:
-        with contextlib.suppress(OSError):  # what could not be written before
-            stream.close()
-        if new and not begun:
-            path.unlink(missing_ok=True)
-        if cut_short:
-            output.say(f"The figures in {path} are cut short: it could not be written to.")
+    with log_file(output, path, "figures") as write:
+        yield lambda figures: write(json.dumps(asdict(figures)))
 
 
 def _line(figures: Figures) -> str:
