@@ -34,14 +34,18 @@ def test_a_board_is_written_and_described(tmp_path: Path) -> None:
 def test_what_cannot_be_printed_is_refused_in_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder.pdf").mkdir()
+    (tmp_path / "profile").mkdir()
+    (tmp_path / "profile" / "profile.json").write_text("{}")
     for words, sentence in (
         (("--rig", "strange", "--out", tmp_path / "b.pdf"), "found none for 'strange'"),
         (("--rig", "lg55-reduced", "--out", tmp_path / "b.png"), "a file that ends in .pdf"),
         (("--rig", "lg55-reduced", "--out", tmp_path / "folder.pdf"), "a file that ends in .pdf"),
         (("--rig", "lg55-reduced", "--out", tmp_path / "file" / "b.pdf"), "Expected to write the results"),
+        (("--rig", "lg55-reduced", "--out", tmp_path / "profile" / "b.pdf"), "inside the profile"),
     ):
         done = udccal(*words)
         assert done.returncode == 1
         assert sentence in done.stderr
     assert udccal("--rig", "lg55-reduced", "--out", tmp_path / "b.pdf", "--paper", "a9").returncode == 2
-    assert {path.name for path in tmp_path.iterdir()} == {"file", "folder.pdf"}
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "folder.pdf", "profile"}
+    assert [path.name for path in (tmp_path / "profile").iterdir()] == ["profile.json"]

@@ -17,7 +17,9 @@ from typer.main import get_command
 
 from udccal.cli.app import app
 from udccal.cli.bench_options import BenchOptions, CameraKind, DisplayKind
+from udccal.cli.jobs.plan import plan_captures
 from udccal.cli.jobs.simulate import simulate_files
+from udccal.cli.jobs.validate import validate_profile, validate_session
 from udccal.cli.output import Output
 from udccal.cli.run import run
 from udccal.errors import UdccalError
@@ -207,3 +209,19 @@ def test_a_bug_asks_for_debug_and_shows_no_traceback() -> None:
     assert done.returncode == 70
     assert "--debug" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("kind", ["profile", "session"])
+def test_results_are_not_written_among_the_files_of_a_profile_or_a_session(tmp_path: Path, kind: str) -> None:
+    out = tmp_path / "place"
+    out.mkdir()
+    (out / f"{kind}.json").write_text("{}")
+    for work in (
+        lambda: simulate_files(Output(), [], "lg55-reduced", out / "new", None, 0),
+        lambda: validate_profile(Output(), Path("no-profile"), Path("no-session"), out),
+        lambda: validate_session(Output(), Path("no-session"), Path("no-session"), out),
+        lambda: plan_captures(Output(), "lg55-reduced", ["wire=0.05%"], None, out / "rig.toml"),
+    ):
+        with pytest.raises(UdccalError, match=f"inside the {kind} "):
+            work()
+    assert [file.name for file in out.iterdir()] == [f"{kind}.json"]

@@ -73,3 +73,6 @@ def test_what_cannot_be_compared_is_refused_in_a_sentence(folder: Path) -> None:
     (broken / PROFILE_NAME).write_text(json.dumps(document))
     assert "Expected a covariance of the geometry estimates" in refused(folder / "a", broken)
     assert "Choose another folder" in refused(folder / "a", folder / "a", "--out", folder / "b.zip" / "out")
+    before = sorted((folder / "a").iterdir())
+    assert "inside the profile" in refused(folder / "a", folder / "b.zip", "--out", folder / "a")
+    assert sorted((folder / "a").iterdir()) == before

@@ -14,7 +14,7 @@ import pytest
 from tests.live.conftest import COLUMNS, ROWS, restored_frame
 from tests.live.test_pipeline import ListSink
 from udccal import plugins
-from udccal.errors import LiveError, UdccalError
+from udccal.errors import LiveError, ProfileError, UdccalError
 from udccal.io.png import read_rgb8
 from udccal.live.sinks.images import ImagesSink
 from udccal.live.sinks.mirrored import MirroredSink
@@ -85,6 +85,14 @@ def test_a_folder_with_files_is_refused(tmp_path: Path) -> None:
     for wrong in (tmp_path, tmp_path / "file", ""):
         with pytest.raises(LiveError, match="new or empty"):
             ImagesSink(str(wrong), 30.0)
+
+
+def test_a_place_in_a_profile_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "profile.json").write_text("{}")
+    for text in (f"images:{tmp_path / 'sub'}", f"video:{tmp_path / 'a.mp4'}"):
+        with pytest.raises(ProfileError, match="inside the profile"):
+            make_sink(text, 30.0)
+    assert [file.name for file in tmp_path.iterdir()] == ["profile.json"]
 
 
 def test_a_video_has_its_name_when_it_is_whole_and_lasts_as_long_as_the_run(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from udccal.cli.jobs.explain import Frames, Plans, explain_plan
 from udccal.cli.jobs.restore import restore_files
 from udccal.cli.output import Output
 from udccal.cli.restore import TierChoice, restore
-from udccal.errors import FileFormatError, RestorationError
+from udccal.errors import FileFormatError, ProfileError, RestorationError, UdccalError
 from udccal.io.png import write_png16, write_rgb8
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.store import write_profile
@@ -105,9 +105,21 @@ def test_a_folder_that_holds_a_profile_is_refused(folder: Path) -> None:
     (folder / "frame.png").rename(folder / "wire_map.png")
     given = replace(frames(folder), images=[folder / "wire_map.png"])
     before = {file: file.read_bytes() for file in (folder / "profile").iterdir()}
-    with pytest.raises(RestorationError, match=r"profile holds profile\.json"):
-        restore_files(Output(), given, Plans(Tier.preview, None), folder / "profile", "exr")
+    for out in (folder / "profile", folder / "profile" / "sub"):
+        with pytest.raises(ProfileError, match=r"inside the profile .*, which holds its own files only"):
+            restore_files(Output(), given, Plans(Tier.preview, None), out, "exr")
     assert {file: file.read_bytes() for file in (folder / "profile").iterdir()} == before
+
+
+def test_no_plan_is_written_into_a_profile_or_a_session(folder: Path) -> None:
+    (folder / "session").mkdir()
+    (folder / "session" / "session.json").write_text("{}")
+    (folder / "link").symlink_to(folder / "profile")
+    before = sorted(folder.rglob("*"))
+    for out, words in (("profile", "inside the profile"), ("link", "inside the profile"), ("session", "the session")):
+        with pytest.raises(UdccalError, match=words):
+            explain_plan(Output(), frames(folder), Plans(Wish(), None), folder / out)
+    assert sorted(folder.rglob("*")) == before
 
 
 @pytest.mark.medium

@@ -36,3 +36,12 @@ def check_apart(file: Path, *given: Path | None) -> None:
                 f"Expected a place apart from {each}, which this command needs for something else, found {file}. "
                 "Choose another path."
             )
+
+
+def check_folder_apart(folder: Path) -> None:
+    """Refuse a folder for results that is a profile or a session, or lies in one; call it before the work.
+
+    Raises:
+        ProfileError, SessionError: as ``check_apart``.
+    """
+    check_apart(folder / "results")

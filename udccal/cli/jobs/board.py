@@ -11,6 +11,7 @@ from udccal.board.instructions import sentences
 from udccal.board.paper import Paper
 from udccal.board.pdf import board_pdf
 from udccal.board.set_up import set_up_of
+from udccal.cli.jobs.apart import check_apart
 from udccal.cli.output import Output
 from udccal.errors import UdccalError
 from udccal.io.atomic import write_atomically
@@ -36,11 +37,13 @@ def write_board(output: Output, rig_name: str, out: Path, paper: Paper | None) -
 
     Raises:
         RigError: when the rig is not known, or its board cannot be printed.
-        UdccalError: when ``out`` is not the name of a PDF, cannot be written, or ``paper`` is too small.
+        UdccalError: when ``out`` is not the name of a PDF, is in a profile or a session, or cannot be written, or
+            ``paper`` is too small.
     """
     if out.suffix.lower() != ".pdf" or out.is_dir():
         raise UdccalError(f"Expected the name of a file that ends in .pdf, found '{out}'. Give --out board.pdf.")
     rig = load_rig(rig_name)
+    check_apart(out)
     check_writable(out.parent)
     set_up = set_up_of(rig)
     pdf, pages = board_pdf(rig.name, set_up, paper)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from udccal.cli.jobs.apart import check_folder_apart
 from udccal.cli.output import Output, plain
 from udccal.comparison.diff import ProfileDiff, compare
 from udccal.comparison.limits import DiffLimits
@@ -27,10 +28,11 @@ def diff_profiles(output: Output, a: Path, b: Path, out: Path | None) -> bool:
 
     Raises:
         ProfileError: when a profile cannot be read, or the two cannot be compared.
-        UdccalError: when ``out`` cannot be written to; this is found before any work.
+        UdccalError: when ``out`` cannot be written to, or is in a profile or a session; this is found before any work.
     """
     keep_compilations()
     if out is not None:
+        check_folder_apart(out)
         check_writable(out)
     one, other = load_profile(a), load_profile(b)
     with output.stage("comparing"):

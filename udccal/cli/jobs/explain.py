@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from udccal.cameras.picture_files.mosaics import read_raw
+from udccal.cli.jobs.apart import check_folder_apart
 from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
@@ -129,6 +130,7 @@ def explain_plan(output: Output, frames: Frames, plans: Plans, out: Path | None)
         UdccalError: as ``restore_files``.
     """
     if out is not None:
+        check_folder_apart(out)
         check_writable(out)
     keep_compilations()
     scene = read_scene(output, frames)

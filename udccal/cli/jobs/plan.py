@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final, get_args
 
+from udccal.cli.jobs.apart import check_apart
 from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.errors import RigError
@@ -63,12 +64,14 @@ def plan_captures(output: Output, rig_name: str, words: Sequence[str], profile: 
     Raises:
         UdccalError: when a target cannot be read, or a procedure is missing.
         RigError: when the rig is not known, or ``out`` exists.
+        ProfileError, SessionError: when ``out`` is in a profile or a session.
         ProfileError: when the profile cannot be read.
     """
     targets = parse_targets(words)
     rig = load_rig(rig_name)
     if out is not None:
         check_absent(out)
+        check_apart(out)
     keep_compilations()
     path = _profile_path(rig_name, profile)
     state = nominal_state(rig) if path is None else _measured(rig, path)

@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from udccal.cli.jobs.apart import check_folder_apart
 from udccal.cli.jobs.explain import Frames, Plans, naming, read_scene
 from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.errors import RestorationError
 from udccal.io.out_folder import check_writable, storing_in
-from udccal.profiles.provenance import PROFILE_NAME
 from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure
-from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.tiers import Tier
 
 
@@ -53,18 +52,15 @@ def restore_files(
         picture_format: ``png``, display-encoded, or ``exr``, linear light in e-/s.
 
     Raises:
-        ProfileError: when the profile cannot be read.
+        ProfileError: when the profile cannot be read, or ``out`` is in a profile.
+        SessionError: when ``out`` is in a session.
         FileFormatError: when an image or the panel's picture cannot be read.
-        RestorationError: when an image or a plan does not fit the profile, an exposure is not known, no tier does
-            what is asked, or ``out`` holds a profile or a session.
+        RestorationError: when an image or a plan does not fit the profile, an exposure is not known, or no tier does
+            what is asked.
         UdccalError: when ``out`` cannot be written to; this is found before any work.
     """
+    check_folder_apart(out)
     check_writable(out)
-    for name in (PROFILE_NAME, MANIFEST_NAME):
-        if (out / name).exists():
-            raise RestorationError(
-                f"Expected a folder for pictures, found that {out} holds {name}. Choose another folder."
-            )
     keep_compilations()
     targets = _targets(frames, out, picture_format)
     scene = read_scene(output, frames)

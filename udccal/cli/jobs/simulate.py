@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from udccal.benches.bench import simulated_rig
 from udccal.benches.photograph import CapturedScene, capture_photograph
+from udccal.cli.jobs.apart import check_folder_apart
 from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.output import Output
 from udccal.errors import UdccalError
@@ -61,8 +62,9 @@ def simulate_files(
         RigError: when the rig is not known.
         FileFormatError: when a photograph or the panel's picture cannot be read; this is found before any work.
         UdccalError: when the results of two photographs would have one name, or the name of a photograph.
-        UdccalError: when ``out`` cannot be written to; this is found before any work.
+        UdccalError: when ``out`` cannot be written to, or is in a profile or a session; this is found before any work.
     """
+    check_folder_apart(out)
     check_writable(out)
     _check_names(images, out)
     rig = load_rig(rig_name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from udccal.cli.jobs.apart import check_folder_apart
 from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
 from udccal.io.atomic import write_atomically
@@ -31,10 +32,11 @@ def validate_profile(output: Output, path: Path, session: Path, out: Path | None
     Raises:
         ProfileError: when the profile cannot be read, or is not of the session's rig.
         SessionError: when the session cannot be read, or no term of it can be judged.
-        UdccalError: when ``out`` cannot be written to; this is found before any work.
+        UdccalError: when ``out`` cannot be written to, or is in a profile or a session; this is found before any work.
     """
     keep_compilations()
     if out is not None:
+        check_folder_apart(out)
         check_writable(out)
     profile, captured = load_profile(path), Session.open(session)
     with output.stage("validating"):
@@ -53,9 +55,10 @@ def validate_session(output: Output, session: Path, against: Path, out: Path | N
 
     Raises:
         SessionError: when a session cannot be read, or they cannot be compared.
-        UdccalError: when ``out`` cannot be written to; this is found before any work.
+        UdccalError: when ``out`` cannot be written to, or is in a profile or a session; this is found before any work.
     """
     if out is not None:
+        check_folder_apart(out)
         check_writable(out)
     both = Session.open(session), Session.open(against)
     with output.stage("comparing"):

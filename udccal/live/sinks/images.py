@@ -9,6 +9,7 @@ from udccal.errors import LiveError
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.io.png import write_rgb8
 from udccal.live.sinks.protocol import RestoredFrame
+from udccal.profiles.store import check_outside_profiles
 
 
 @final
@@ -23,6 +24,7 @@ class ImagesSink:
             raise LiveError(
                 f"Expected images:FOLDER with a folder that is new or empty, found '{target}'. Choose another folder."
             )
+        check_outside_profiles(self._folder)
         check_writable(self._folder)
 
     def open(self, shape: tuple[int, int]) -> None:

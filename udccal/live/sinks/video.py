@@ -12,6 +12,7 @@ from udccal.errors import LiveError
 from udccal.io.atomic import atomic_path
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.live.sinks.protocol import RestoredFrame
+from udccal.profiles.store import check_outside_profiles
 
 _CODEC = "mp4v"
 
@@ -38,6 +39,7 @@ class VideoSink:
                 f"Expected video:FILE.mp4 in a folder that exists, found '{target}'. Choose another name, or make "
                 "the folder."
             )
+        check_outside_profiles(self._path)
         check_writable(self._path.parent)
 
     def open(self, shape: tuple[int, int]) -> None:
