@@ -155,27 +155,30 @@ def check_term(term: Any, name: str, rig: RigDescription) -> None:
     _TOGETHER.get(type(term), _nothing)(term, name, rig)
 
 
-def check_ranges(term: Any, name: str) -> None:
-    """Refuse a term with a number out of its own range, whatever the others are; name and errors as ``check_term``."""
+def check_ranges(term: Any, name: str, advice: str = _ADVICE) -> None:
+    """Refuse a term with a number out of its own range, whatever the others are; name and errors as ``check_term``.
+
+    ``advice`` ends the message.
+    """
     sizes: dict[str, int] = {}
     for field, allowed in RANGES[type(term)].items():
         value, where = getattr(term, field), f"{name}.{field}"
         match allowed:
             case Real():
-                _check_real(value, allowed, where, sizes)
+                _check_real(value, allowed, where, sizes, advice)
             case Whole():
                 _require(
                     isinstance(value, int) and not isinstance(value, bool) and allowed.low <= value <= allowed.high,
-                    where, f"a whole number from {allowed.low} to {allowed.high}", value,
+                    where, f"a whole number from {allowed.low} to {allowed.high}", value, advice,
                 )  # fmt: skip
             case Text():
-                _require(isinstance(value, str), where, "a word", value)
+                _require(isinstance(value, str), where, "a word", value, advice)
             case _:
-                _require(isinstance(value, allowed), where, f"a {allowed.__name__}", value)
-                check_ranges(value, where)
+                _require(isinstance(value, allowed), where, f"a {allowed.__name__}", value, advice)
+                check_ranges(value, where, advice)
 
 
-def _check_real(value: Any, allowed: Real, where: str, sizes: dict[str, int]) -> None:
+def _check_real(value: Any, allowed: Real, where: str, sizes: dict[str, int], advice: str) -> None:
     number = isinstance(value, int | float | np.ndarray | np.generic) and not isinstance(value, bool)
     array = np.asarray(value if number else "")
     wanted = tuple(sizes.get(size, size) if isinstance(size, str) else size for size in allowed.shape)
@@ -184,19 +187,20 @@ def _check_real(value: Any, allowed: Real, where: str, sizes: dict[str, int]) ->
     )
     of_shape = f" of shape ({', '.join(map(str, wanted))})" if wanted else ""
     real = number and fits and (isinstance(value, int) or np.issubdtype(array.dtype, np.floating))
-    _require(real, where, f"real numbers{of_shape}" if wanted else "a real number", _summary(value))
+    _require(real, where, f"real numbers{of_shape}" if wanted else "a real number", _summary(value), advice)
     sizes.update((size, found) for size, found in zip(wanted, array.shape, strict=True) if isinstance(size, str))
     wrong = array[~((array >= allowed.low) & (array <= allowed.high))]
-    _require(not wrong.size, where, f"from {allowed.low:g} to {allowed.high:g}", wrong[0] if wrong.size else None)
+    found = wrong[0] if wrong.size else None
+    _require(not wrong.size, where, f"from {allowed.low:g} to {allowed.high:g}", found, advice)
 
 
 def _summary(value: Any) -> Any:
     return f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else value
 
 
-def _require(holds: bool, where: str, expected: str, found: object) -> None:
+def _require(holds: bool, where: str, expected: str, found: object, advice: str = _ADVICE) -> None:
     if not holds:
-        raise ProfileError(f"Expected '{where}' to be {expected}, found {str(found)[:60]}. {_ADVICE}")
+        raise ProfileError(f"Expected '{where}' to be {expected}, found {str(found)[:60]}. {advice}")
 
 
 def _nothing(term: Any, name: str, rig: RigDescription) -> None:

@@ -16,12 +16,17 @@ from udccal.cli.jobs.show import show_profile
 from udccal.cli.output import Output
 from udccal.cli.profile import ExportTo, ImportFrom
 from udccal.errors import ProfileError
+from udccal.fitting.nominal import nominal_geometry
 from udccal.profiles.exchange.exports import EXPORTS, export_profile
 from udccal.profiles.exchange.imports import IMPORTS, MOST_BYTES, profile_of, read_lens
-from udccal.profiles.exchange.lens import lens_of
+from udccal.profiles.exchange.lens import Pose, lens_of
+from udccal.profiles.exchange.usable import check_usable
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import read_profile, write_profile
-from udccal.rig import RigDescription
+from udccal.reports.true_values import true_geometry
+from udccal.rig import RigDescription, load_rig
+from udccal.rig_folders import rig_names, shipped_rig_folder
+from udccal.simulation.truth import draw_truth
 
 
 def test_the_command_offers_what_there_is() -> None:
@@ -71,8 +76,50 @@ def test_a_lens_of_another_sensor_is_refused(profile: Profile) -> None:
     with pytest.raises(ProfileError, match="found one for 97 x 64 px"):
         profile_of(other, profile.rig, "f")
     wild = dataclasses.replace(lens_of(profile), focal_px=np.array([1e7, 80.0]))
-    with pytest.raises(ProfileError, match=r"'geometry\.focal_px' to be from 1 to 1e\+06"):
+    with pytest.raises(ProfileError, match=r"'geometry\.focal_px' to be from 1 to 1e\+06, .*\. Correct it in f\.$"):
         profile_of(wild, profile.rig, "f")
+
+
+UNUSABLE: dict[str, tuple[dict[str, object], str]] = {
+    "a camera that looks away": (
+        {"pose": Pose(np.diag([-1.0, 1.0, -1.0]), np.array([9.0, 9.0, -14.0]))},
+        "R_panel_camera",
+    ),
+    "a camera that looks along the panel": (
+        {"pose": Pose(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([9.0, 9.0, -14.0]))},
+        "R_panel_camera",
+    ),
+    "a camera before the panel": ({"pose": Pose(np.eye(3), np.array([9.0, 9.0, 14.0]))}, "pupil_mm"),
+    "a camera in the panel": ({"pose": Pose(np.eye(3), np.zeros(3))}, "pupil_mm"),
+    "a folded picture": ({"distortion": np.array([-0.75, 0.0, 0.0, 0.0, 0.0])}, "distortion_coefficients"),
+    "a picture that folds at its corners": (
+        {"distortion": np.array([-0.9, 0.4, 0.0, 0.0, 0.0])},
+        "distortion_coefficients",
+    ),
+    "a principal point far off": ({"principal_point_px": np.array([9e4, 30.0])}, "camera_matrix"),
+    "a focal length of a pixel": ({"focal_px": np.array([1.0, 80.0])}, "camera_matrix"),
+    "a picture that looks back from the nominal pose": (
+        {"principal_point_px": np.array([46.0, -366.0]), "distortion": np.zeros(5), "pose": None},
+        "camera_matrix",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", UNUSABLE)
+def test_a_lens_that_nothing_can_be_restored_with_is_refused(profile: Profile, fault: str) -> None:
+    changes, entry = UNUSABLE[fault]
+    with pytest.raises(ProfileError, match=rf"'{entry}'.* in camera\.yaml ") as refused:
+        profile_of(dataclasses.replace(lens_of(profile), **changes), profile.rig, "camera.yaml (opencv-yaml)")
+    assert "found" in str(refused.value)
+
+
+@pytest.mark.parametrize("name", rig_names(shipped_rig_folder()))
+def test_lenses_of_shipped_rigs_and_stronger_ones_are_usable(name: str) -> None:
+    rig = load_rig(name)
+    true = [true_geometry(draw_truth(rig, seed)) for seed in (0, 1)]
+    stronger = [np.array([k1, -0.2 * k1, 1e-3, -1e-3, 0.0]) for k1 in (-0.3, 0.3)]
+    for geometry in (*true, *(dataclasses.replace(nominal_geometry(rig), distortion=each) for each in stronger)):
+        check_usable(geometry, True, rig, "f")
 
 
 MODEL = "{'lensmodel': 'LENSMODEL_OPENCV5', 'intrinsics': [80, 81, 46, 30, .1, .2, .3, .4, .5], 'imagersize': [96, 64]}"

@@ -15,9 +15,10 @@ from udccal.models.geometry import Geometry
 from udccal.profiles.exchange import mrcal, opencv_yaml, ros_camera_info
 from udccal.profiles.exchange.format import ImportFormat
 from udccal.profiles.exchange.lens import Lens
+from udccal.profiles.exchange.usable import check_usable
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import as_text, provenance_now
-from udccal.profiles.ranges import check_term
+from udccal.profiles.ranges import check_ranges
 from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 
@@ -58,7 +59,8 @@ def profile_of(lens: Lens, rig: RigDescription, source: str) -> Profile:
         source: where the lens comes from, for the notes.
 
     Raises:
-        ProfileError: when the lens is of another size than the rig's sensor, or a number is out of range.
+        ProfileError: when the lens is of another size than the rig's sensor, a number is out of range, or no
+            picture could be restored with the lens or its pose.
     """
     camera = rig.camera
     if (lens.columns, lens.rows) != (camera.columns, camera.rows):
@@ -67,7 +69,8 @@ def profile_of(lens: Lens, rig: RigDescription, source: str) -> Profile:
             f"{lens.columns} x {lens.rows} px. Name the rig with this camera."
         )
     geometry = _geometry(lens, nominal_geometry(rig))
-    check_term(geometry, "geometry", rig)
+    check_ranges(geometry, "geometry", f"Correct it in {source}.")
+    check_usable(geometry, lens.pose is not None, rig, source)
     posed = "" if lens.pose is not None else " Its pose behind the panel is the rig description's nominal one."
     note = f"Imported from {as_text(source)}, which gives no error bars.{posed}"
     nobody = FitStatus.NOT_CAPTURED
