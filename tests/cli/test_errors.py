@@ -154,7 +154,7 @@ def test_photographs_are_read_before_any_is_simulated(tmp_path: Path) -> None:
     write_rgb8(tmp_path / "good.png", np.full((8, 8, 3), 90, np.uint8))
     (tmp_path / "bad.png").write_text("no picture")
     pictures = [tmp_path / "good.png", tmp_path / "bad.png"]
-    with pytest.raises(UdccalError, match=r"bad\.png"):
+    with pytest.raises(UdccalError, match=r"bad\.png .* found another kind\. Convert it"):
         simulate_files(Output(), pictures, "lg55-reduced", tmp_path / "out", None, 0)
     assert not (tmp_path / "out").exists()
 

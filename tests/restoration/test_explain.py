@@ -122,6 +122,17 @@ def test_no_plan_is_written_into_a_profile_or_a_session(folder: Path) -> None:
     assert sorted(folder.rglob("*")) == before
 
 
+@pytest.mark.parametrize(("out", "image"), [("out\udcff", "frame.png"), ("out", "frame\udcff.png")])
+def test_an_exr_file_that_cannot_be_named_is_refused_before_the_work(
+    folder: Path, out: str, image: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.restore.read_scene", lambda *_: pytest.fail("worked"))
+    given = replace(frames(folder), images=[folder / image])
+    with pytest.raises(FileFormatError, match="the path of an EXR file in UTF-8"):
+        restore_files(Output(), given, Plans(Tier.preview, None), folder / out, "exr")
+    assert not (folder / out).exists()
+
+
 @pytest.mark.medium
 def test_what_was_written_before_a_frame_that_is_refused_is_told(folder: Path, profile: Profile) -> None:
     rig = profile.rig.model_copy(update={"panel": load_rig("lg55-reduced").panel})

@@ -65,12 +65,15 @@ def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "rows columns
     planes = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in channels.items()}
     shapes = {plane.shape for plane in planes.values()}
     if len(shapes) != 1:
-        raise FileFormatError(f"Expected channels of one size for {path}, found sizes {sorted(shapes)}.")
+        raise FileFormatError(f"Expected channels of one size for {path}, found sizes {sorted(shapes)}. Give all one.")
     rows, columns = shapes.pop()
     check_size(path, rows, columns, len(planes))
     for name, plane in planes.items():
         if not np.isfinite(plane).all():
-            raise FileFormatError(f"Expected finite numbers in channel '{name}' of {path}, found NaN or infinity.")
+            raise FileFormatError(
+                f"Expected finite numbers for channel '{name}' of {path}, found NaN or infinity. Check what they were "
+                "computed from."
+            )
     header = {"compression": _COMPRESSION, "type": OpenEXR.scanlineimage}
     check_path(path)
     with atomic_path(path) as temporary, OpenEXR.File(header, planes) as file:

@@ -49,7 +49,10 @@ def _decoded(path: Path, content: bytes) -> np.ndarray:
     """Decode blue, green and red, after checking the file's header and chunks."""
     size = picture_size(content)
     if size is None:
-        raise FileFormatError(f"Expected {path} to be a PNG, JPEG, Radiance or OpenEXR picture, found another kind.")
+        raise FileFormatError(
+            f"Expected {path} to be a PNG, JPEG, Radiance or OpenEXR picture, found another kind. Convert it, or check "
+            "the path."
+        )
     check_size(path, *size, 3)
     fault = png_fault(content) if content.startswith(SIGNATURE) else None
     encoded = np.frombuffer(content, np.uint8)

@@ -13,6 +13,7 @@ from udccal.cli.jobs.explain import Frames, Plans, naming, read_scene
 from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.errors import RestorationError
+from udccal.io.exr import check_path
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.runtime import Restorer
@@ -54,7 +55,7 @@ def restore_files(
     Raises:
         ProfileError: when the profile cannot be read, or ``out`` is in a profile.
         SessionError: when ``out`` is in a session.
-        FileFormatError: when an image or the panel's picture cannot be read.
+        FileFormatError: when an image or the panel's picture cannot be read, or an EXR file's path is not UTF-8.
         RestorationError: when an image or a plan does not fit the profile, an exposure is not known, or no tier does
             what is asked.
         UdccalError: when ``out`` cannot be written to; this is found before any work.
@@ -63,6 +64,9 @@ def restore_files(
     check_writable(out)
     keep_compilations()
     targets = _targets(frames, out, picture_format)
+    if picture_format == "exr":
+        for target in targets:
+            check_path(target)
     scene = read_scene(output, frames)
     plan = scene.plan(plans)
     restored: list[RestoredFile] = []
