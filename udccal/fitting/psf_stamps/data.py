@@ -102,7 +102,8 @@ class Stamps:
     @cached_property
     def frame_px(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
         """Centre c and half size h of the stamps' positions p, for which (p - c) / h is within [-1, 1]."""
-        low, high = self.position_px.min(axis=0), self.position_px.max(axis=0)
+        position_px = self.position_px.astype(np.float64)
+        low, high = position_px.min(axis=0), position_px.max(axis=0)
         return (low + high) / 2.0, np.maximum((high - low) / 2.0, 1.0)
 
     @cached_property
