@@ -74,7 +74,7 @@ def _unpack(path: Path) -> None:
 
 
 EXCHANGE_TARGETS = (
-    _lens("ros-camera-info", _ROS, _ROS.replace("[-.06, 2e-2, 0., 0, 1.]", "\n  - -.06\n  - 2e-2\n  - 0\n  - 0\n  - 0")),
+    _lens("ros-camera-info", _ROS, _ROS.replace("[-.06, .02, 0., 0, 1.]", "\n  - -.06\n  - 2e-2\n  - 0\n  - 0\n  - 0")),
     _lens("opencv-yaml", _OPENCV),
     _lens("mrcal", _MRCAL, _MRCAL.replace("LENSMODEL_OPENCV8", "LENSMODEL_OPENCV5").replace(", 0, 0, 0,]", "]")),
     Target("packed-profile", of_file("p.zip", _unpack), lambda: (_zip(),), 2048),
