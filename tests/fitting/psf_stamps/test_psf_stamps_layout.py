@@ -52,3 +52,11 @@ def test_a_strip_tells_its_psf_and_refuses_places_far_from_it() -> None:
         result.term.predict(np.array([[0.5, 0.5], [0.2, 0.9]]) * SENSOR)
     with pytest.raises(FitError, match="add stars there"):
         result.term.sigma(np.array([[1e6, 1e6]]))
+
+
+def test_stars_about_an_empty_middle_are_fitted() -> None:
+    """The map there is nobody's measurement, and stops no fit; those who ask are answered or refused."""
+    angle = np.linspace(0.0, 2 * np.pi, 26, endpoint=False)
+    result = fitted(0.5 + 0.44 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    assert result.term.relative_l2(result.term.star_px).shape == (26, 2)
+    assert result.status is not FitStatus.CONVERGED or result.term.sigma(np.array([[0.5, 0.5]]) * SENSOR).min() > 0

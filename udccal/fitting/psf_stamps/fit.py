@@ -201,9 +201,7 @@ def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
     stars = stamps.position_px.astype(np.float64), state.centre_px, state.light_e
     (centre, half), (_, rows, columns) = stamps.frame_px, stamps.values_e.shape
     term = StampsPsf(state.field, factor, centre, half, rows, columns, WINDOW_PX, *stars)
-    # A Gaussian of the kernel's width, by its noise-equivalent area of 4 pi sigma^2.
-    kernel = term.predict(term.centre_px[None], state.field.reference)
-    return replace(term, window_px=float(1 / np.sqrt(4 * np.pi * (kernel**2).sum())))
+    return term.with_own_window()
 
 
 def _told(state: State) -> tuple[str, ...]:

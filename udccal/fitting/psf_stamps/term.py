@@ -85,16 +85,17 @@ class StampsPsf:
         """Return kernels centred on the middle sample, at positions (x, y) on the sensor in px.
 
         Raises:
-            FitError: when positions are none on a sensor, or there is no such plane; so do ``sigma``, ``relative_l2``.
+            FitError: when positions are none on a sensor, or far from all stars, or there is no such plane; so do
+                ``sigma`` and ``relative_l2``.
         """
-        parts = [kernels.value for kernels in replace(self, factor=self.factor[:, :0])._kernels(position_px, plane)]
+        parts = [kernels.value for kernels in replace(self, factor=self.factor[:, :0])._asked(position_px, plane)]
         return np.concatenate([*parts, self._no_kernels]).reshape(-1, self.rows, self.columns)
 
     @in_float64
     def sigma(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
         """Return one standard deviation of every pixel of ``predict``."""
         parts = []
-        for kernels in self._kernels(position_px, plane):
+        for kernels in self._asked(position_px, plane):
             sigma, peak = np.linalg.norm(kernels.change, axis=2), np.abs(kernels.value).max(axis=1, keepdims=True)
             # Beyond the nodes, nothing is known but that light is below the least that the prior expects.
             parts.append(np.where(sigma > 0, sigma, LEAST * peak))
@@ -107,7 +108,7 @@ class StampsPsf:
         The error is the one after the best amplitude and shift, which are a matter of convention.
         """
         each = [np.zeros((0, self.factor.shape[1]))]
-        for kernels in self._kernels(position_px, plane):
+        for kernels in self._asked(position_px, plane):
             free, _ = np.linalg.qr(np.concatenate([kernels.value[..., None], kernels.jacobian], axis=2))
             change = kernels.change - free @ (free.transpose(0, 2, 1) @ kernels.change)
             each.append(np.linalg.norm(change, axis=1) / np.linalg.norm(kernels.value, axis=1)[:, None])
@@ -148,11 +149,20 @@ class StampsPsf:
         """What there is at no position at all."""
         return np.zeros((0, self.rows * self.columns))
 
-    def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
-        """Yield kernels with their changes, eight positions at a time: this size needs one compilation."""
+    def with_own_window(self) -> StampsPsf:
+        """Return the term with a window as wide as its middle kernel, whose noise-equivalent area is 4 pi sigma^2."""
+        middle = replace(self, factor=self.factor[:, :0])._kernels(self.centre_px[None], self.field.reference)
+        return replace(self, window_px=float(1 / np.sqrt(4 * np.pi * (next(middle).value ** 2).sum())))
+
+    def _asked(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
+        """Yield kernels at positions that somebody asks for."""
         check_positions(position_px, "n", "Give (x, y) in px for each kernel.", FitError)
         check_count(plane, "a plane", 0, len(self.field.nodes) - 1, FitError)
         self._check_like_stars(np.asarray(position_px, dtype=np.float64))
+        return self._kernels(position_px, plane)
+
+    def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
+        """Yield kernels with their changes, eight positions at a time: this size needs one compilation."""
         grid = offsets(self.rows, self.columns)
         window = grid * np.exp(-0.5 * (grid**2).sum(axis=1) / self.window_px**2)[:, None]
         for start in range(0, len(position_px), 8):
@@ -174,8 +184,10 @@ class StampsPsf:
             np.linalg.det(self.field.maps((place - self.centre_px) / self.half_px)[:, self.field.reference])
             for place in (position_px, self.star_px)
         ]
-        low, high = areas[1].min() / _MOST_STRETCH, areas[1].max() * _MOST_STRETCH
-        off = ~((areas[0] > low) & (areas[0] < high))
+        least, most = areas[1].min(), areas[1].max()
+        # A poor fit may turn the map over at a star.
+        low, high = min(least / _MOST_STRETCH, least), max(most * _MOST_STRETCH, most)
+        off = ~((areas[0] >= low) & (areas[0] <= high))
         if off.any():
             (left, top), (right, bottom) = self.centre_px - self.half_px, self.centre_px + self.half_px
             x, y = position_px[off][0]
