@@ -129,6 +129,14 @@ def check_array(
         raise error(f"{expected}, found {found_instead(value)}. {advice}")
 
 
+def array_of(value: object) -> np.ndarray:
+    """Return what numpy makes of a value; an empty array of objects where lists have different lengths."""
+    try:
+        return np.asarray(value)
+    except ValueError:
+        return np.empty(0, dtype=object)
+
+
 def check_positions(value: object, count: int | str, advice: str, error: type[UdccalError]) -> None:
     """Refuse what are no positions (x, y) in px on a sensor, one per row.
 

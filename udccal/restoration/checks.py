@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from udccal.arguments import check_number, check_unmasked, found_instead
+from udccal.arguments import array_of, check_number, check_unmasked, found_instead
 from udccal.errors import RestorationError, UdccalError
 from udccal.models.noise import scalar
 from udccal.profiles.profile import Profile
@@ -23,10 +23,7 @@ def real_array(value: object, what: str) -> np.ndarray:
         RestorationError: when it does not hold real numbers, or some are masked; ``what`` names it.
     """
     check_unmasked(value, what, RestorationError)
-    try:
-        found = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        found = np.empty(0, dtype=object)
+    found = array_of(value)
     if found.dtype.kind not in "iuf":
         raise RestorationError(
             f"Expected {what} as an array of real numbers, found {found_instead(value)}. Convert it first."

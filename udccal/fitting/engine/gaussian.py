@@ -9,7 +9,7 @@ from typing import Generic, TypeVar, final
 import numpy as np
 from jaxtyping import Float
 
-from udccal.arguments import found_instead
+from udccal.arguments import array_of, found_instead
 from udccal.errors import FitError
 from udccal.numerics import in_float64
 from udccal.result import Propagated
@@ -150,10 +150,7 @@ def _numbers_of(f: Callable[[Term], object], term: Term) -> Float[np.ndarray, "*
     if not callable(f):
         raise FitError(f"Expected a function of the term, found {found_instead(f)}. {advice}")
     made = f(term)
-    try:
-        found = np.asarray(made)
-    except ValueError:  # lists of different lengths
-        found = np.empty(0, dtype=object)
+    found = array_of(made)
     if found.dtype.kind not in "biuf":
         raise FitError(f"Expected real numbers of the function, found {found_instead(made)}. {advice}")
     if bad := int(np.count_nonzero(~np.isfinite(found))):

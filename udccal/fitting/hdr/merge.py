@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 from scipy.special import ndtr
 
-from udccal.arguments import check_optional, check_unmasked, found_instead
+from udccal.arguments import array_of, check_optional, check_unmasked, found_instead
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.hdr.likelihood import (
@@ -129,10 +129,7 @@ def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposur
         raise FitError(f"{expected}, found {found_instead(frames)}. Pass raw codes.")
     if len(frames) and not frames.size:
         raise FitError(f"Expected frames with pixels, found the shape {frames.shape}. Pass whole frames.")
-    try:
-        given = np.asarray(exposures_s)
-    except ValueError:  # lists of different lengths
-        given = np.zeros(0)
+    given = array_of(exposures_s)
     times = given.astype(np.float64) if given.dtype.kind in "iuf" else np.zeros(0)
     # Single precision holds the rates of these exposures.
     if times.shape != (len(frames),) or not len(times) or not np.all((times >= 1e-9) & (times <= 1e6)):
