@@ -28,7 +28,7 @@ from udccal.result import FitStatus
 from udccal.rig import load_rig
 from udccal.tiers import Tier
 
-TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 1e-6, 2e-8, 1e-8, 3e-7, 1e-7)))
+TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 1e-6, 2e-8, 1e-8, 3e-7, 1e-7, 1e-2)))
 
 
 @pytest.fixture(autouse=True)

@@ -80,3 +80,15 @@ def test_detail_to_the_pixel_is_expected_to_lose_more(
     assert sharp.psnr_dB(Tier.balanced) < smooth.psnr_dB(Tier.balanced) - 3.0
     # With the other's loss, the forecast is that of another scene.
     assert replace(sharp, lost=smooth.lost).psnr_dB(Tier.balanced) > sharp.psnr_dB(Tier.balanced) + 1.0
+
+
+def test_halos_of_lamps_are_errors_of_all_tiers_but_the_one_that_takes_them_off(
+    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray
+) -> None:
+    dark = expected_of(restorers, exposed(restorers[Tier.fast], toy_grid, toy_scene))
+    assert dark.halos == 0.0
+    lit = replace(dark, halos=1e-2)
+    assert lit.psnr_dB(Tier.accurate) == dark.psnr_dB(Tier.accurate)
+    for tier in (Tier.preview, Tier.fast, Tier.balanced):
+        error = 10 ** (-dark.psnr_dB(tier) / 10) + 1e-2
+        assert lit.psnr_dB(tier) == pytest.approx(-10 * np.log10(error))

@@ -19,7 +19,7 @@ from udccal.result import FitStatus
 from udccal.tiers import Tier
 
 EXPOSURE_S = 0.02
-TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 1e-6, 2e-8, 1e-8, 3e-7, 1e-7)))
+TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 1e-6, 2e-8, 1e-8, 3e-7, 1e-7, 1e-2)))
 
 
 @pytest.fixture
@@ -137,10 +137,14 @@ def test_a_frame_that_clips_is_expected_to_take_longer(profile: Profile, frame: 
 
 
 def test_times_grow_with_pixels_and_with_what_is_done() -> None:
-    small, large = FrameSize(1000, 600, 500, 1500, 0), FrameSize(4000, 2400, 2000, 6000, 0)
+    small, large = FrameSize(1000, 600, 500, 1500, 0, 0), FrameSize(4000, 2400, 2000, 6000, 0, 0)
     for tier in Tier:
         assert large.ms(tier, TIMES) == pytest.approx(4 * small.ms(tier, TIMES))
     # Of a frame whose parts take a fifth longer together than alone.
     assert small.ms(Tier.fast, TIMES) == pytest.approx(1.2e3 * (1000e-8 + 500 * 2e-8 + 1500e-7))
-    sharp = FrameSize(1000, 600, 500, 0, 0)
+    # Each piece that may be a lamp takes two fits, at the tier that tries them.
+    with_lamps = FrameSize(1000, 600, 500, 1500, 0, 3)
+    assert with_lamps.ms(Tier.accurate, TIMES) - small.ms(Tier.accurate, TIMES) == pytest.approx(1e3 * 2 * 3 * 1e-2)
+    assert with_lamps.ms(Tier.balanced, TIMES) == small.ms(Tier.balanced, TIMES)
+    sharp = FrameSize(1000, 600, 500, 0, 0, 0)
     assert sharp.ms(Tier.balanced, TIMES) == sharp.ms(Tier.fast, TIMES) < small.ms(Tier.fast, TIMES)

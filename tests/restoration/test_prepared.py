@@ -68,7 +68,7 @@ def test_an_entry_is_read_again(folder: Path) -> None:
 
 def test_times_are_those_of_a_processor_with_so_many_cores(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cache folder may be shared by computers."""
-    monkeypatch.setattr(frame_time, "_measured", lambda options: PartTimes(*(np.array(1e-8) for _ in range(9))))
+    monkeypatch.setattr(frame_time, "_measured", lambda options: PartTimes(*(np.array(1e-8) for _ in range(10))))
     part_times(_OPTIONS, folder)
     part_times(_OPTIONS, folder)
     assert len(list(folder.iterdir())) == 1

@@ -4,8 +4,9 @@ The three quicker tiers' pictures are made. What ``balanced`` takes out of that 
 much noise it leaves. Each place also gets the variance of the detail that the tile's filter loses (``lost_detail``);
 within a tile it follows the square of the light. How much detail there is where the filter finds none, the finest
 detail that it finds tells: where two octaves of it hardly differ, the scene goes on as strong. The quicker tiers differ
-from ``balanced`` by errors of their own. Errors of the profile, light that clips, and what is left of the light of a
-panel whose picture is not known, are not part of it.
+from ``balanced`` by errors of their own, and all three leave the halos of lamps, which ``accurate`` takes off. Errors
+of the profile, other light that clips, and what is left of the light of a panel whose picture is not known, are not
+part of it.
 """
 
 from __future__ import annotations
@@ -53,18 +54,20 @@ class ExpectedError:
         light: the scene.
         lost: variance of the detail that the filters lose.
         apart: mean square difference of quicker tiers' display-encoded pictures from that of ``balanced``.
+        halos: the same of ``balanced`` with the halos of lamps and without.
     """
 
     light: Places
     lost: Places
     apart: dict[Tier, float]
+    halos: float
 
     def psnr_dB(self, tier: Tier) -> float:
         """Return the PSNR of display-encoded values."""
         sigma, truth = np.sqrt(self.lost), encode_srgb(self.light)
         squared = [np.mean((encode_srgb(self.light + node * sigma) - truth) ** 2) for node in _NODES]
         balanced = _LEFT * self.apart[Tier.fast] + float(np.dot(_WEIGHTS, squared) / _WEIGHTS.sum())
-        error = _NETWORK * balanced if tier is Tier.accurate else balanced + self.apart.get(tier, 0.0)
+        error = _NETWORK * balanced if tier is Tier.accurate else balanced + self.halos + self.apart.get(tier, 0.0)
         return float(-10.0 * np.log10(max(error, 1e-12)))
 
 
@@ -94,11 +97,16 @@ def expected_error(
     view = restorer.strip_rectification
     best, found = (view.apply(picture) / white_e for picture in (balanced, solved.picture))
     quick = preview.restore(mosaic, exposure_s, panel_picture) * (np.float32(exposure_s) / white_e)
+    dark = sharpener.without_lamps(*given)
+    halos = 0.0
+    if dark.white_e is not None:
+        without = sharpener.apply(dark.signal_e, light.variance_e2, dark.clipped)
+        halos = _apart(view.apply(dark.put_back(without, sharpener.layout.inner)) / white_e, best)
     apart = {Tier.preview: _apart(quick, best), Tier.fast: _apart(found, best)}
     flatness = min(_flatness(encode_srgb(balanced / white_e)), _FLATTEST)
     part = _FLAT * flatness**_EXPONENT + _COARSE / (1 + solved.strengths)
     of_tile = lost.variance[sharpener.layout.kernel, np.searchsorted(STRENGTHS, solved.strengths)] * part[:, None]
-    return ExpectedError(*_at_places(sharpener, solved, of_tile, white_e), apart)
+    return ExpectedError(*_at_places(sharpener, solved, of_tile, white_e), apart, halos)
 
 
 def _apart(picture: Places, best: Places) -> float:

@@ -24,6 +24,9 @@ from udccal.restoration.clipped import QUICK, THOROUGH, Effort, clipped_tiles, c
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.filter_tables import FilterTables
+from udccal.restoration.lamp_fit import Responses, lamp_light
+from udccal.restoration.lamp_pieces import hidden_samples, lamp_pieces
+from udccal.restoration.lamps import ROUNDS
 from udccal.restoration.linear import to_electrons, variance_e2
 from udccal.restoration.mosaic_filter import filtered_and_joined
 from udccal.restoration.network import corrected, noise_planes
@@ -38,8 +41,8 @@ from udccal.restoration.tone import Tone
 from udccal.tiers import Tier
 
 _ROWS, _COLUMNS, _RUNS = 512, 768, 5
-# Part of a tile's samples that clip; it hardly matters to their time.
-_CLIPPED = 0.02
+# Part of a tile's samples that clip; it hardly matters to their time. Radius of a lamp.
+_CLIPPED, _LAMP_PX = 0.02, 7.0
 # Of a frame's parts over the same measured alone, each of which then finds its arrays in the cache: the median of the
 # scenes of docs/restoration.md at the tiers fast (1.20) and balanced (1.24).
 _TOGETHER = 1.2
@@ -61,6 +64,7 @@ class PartTimes:
         view: resampling and tone, per pixel of the view.
         preview: all of a preview, per pixel of the rows that the view needs.
         completion: of clipped samples, per pixel of the tiles that have some. quick_completion: at the tier fast.
+        lamp: of the tier ``accurate``, per piece of clipped samples that may be one.
     """
 
     linear: Seconds
@@ -72,6 +76,7 @@ class PartTimes:
     preview: Seconds
     completion: Seconds
     quick_completion: Seconds
+    lamp: Seconds
 
 
 @final
@@ -85,6 +90,7 @@ class FrameSize:
         view_px: pixels of the view.
         tile_px: pixels of all tiles; 0 where nothing is deblurred.
         clipped_px: pixels of the tiles in which samples clip.
+        lamps: pieces of clipped samples that may be lamps.
     """
 
     strip_px: int
@@ -92,19 +98,26 @@ class FrameSize:
     view_px: int
     tile_px: int
     clipped_px: int
+    lamps: int
 
     @classmethod
     def of(
-        cls, layout: TileLayout, view_px: int, blurred: bool, clipped: Bool[np.ndarray, "strip_rows columns"]
+        cls,
+        layout: TileLayout,
+        view_px: int,
+        blurred: bool,
+        clipped: Bool[np.ndarray, "strip_rows columns"],
+        most_lamps: int,
     ) -> FrameSize:
         """Return the size of a frame in the tiles of ``layout``; ``clipped`` are samples of the rows ``reach``."""
         of_tile = layout.rows * layout.columns
         tile_px, clipped_px = layout.count * of_tile, len(clipped_tiles(clipped, layout)[0]) * of_tile
         strip_rows = layout.reach.stop - layout.reach.start if blurred else layout.frame_rows
         strip_px = strip_rows * layout.frame_columns
-        return cls(
-            strip_px, int(np.prod(layout.covered)), view_px, tile_px if blurred else 0, clipped_px if blurred else 0
-        )
+        covered_px = int(np.prod(layout.covered))
+        if not blurred:
+            return cls(strip_px, covered_px, view_px, 0, 0, 0)
+        return cls(strip_px, covered_px, view_px, tile_px, clipped_px, len(lamp_pieces(clipped, layout, most_lamps)))
 
     def ms(self, tier: Tier, times: PartTimes) -> float:
         """Return the milliseconds from a raw frame to a picture of 8 bits at a tier."""
@@ -120,6 +133,7 @@ class FrameSize:
         seconds = _TOGETHER * seconds
         if tier is Tier.accurate:
             seconds = seconds + self.tile_px * times.filter + self.covered_px * times.network
+            seconds = seconds + ROUNDS * self.lamps * times.lamp
         return 1e3 * float(seconds)
 
 
@@ -169,6 +183,18 @@ def _measured(options: PlanOptions) -> PartTimes:
         planes = noise_planes(bands, unit, signal, layout)
         corrected(picture, picture, picture, picture, planes, options.network_views)
 
+    disc = (
+        np.hypot(*np.mgrid[: layout.rows, : layout.columns] - np.array([[[layout.rows]], [[layout.columns]]]) / 2)
+        < _LAMP_PX
+    )
+    hidden, even = hidden_samples(disc), np.full(disc.shape, 10.0)
+    start = np.full((3, np.count_nonzero(disc)), 100.0)
+    kernels = np.full((3, 129, 33), 1 / (129 * 33))
+
+    def lamp() -> None:
+        responses = Responses.of(tables.at(0), np.float32(64), kernels, cfa, disc.shape)
+        lamp_light(np.where(disc, 20.0, 0.0), even, hidden, ~disc, disc, start, responses)
+
     parts = (
         (linear, mosaic.size),
         (lambda: demosaic(signal, cfa.name), mosaic.size),
@@ -179,6 +205,7 @@ def _measured(options: PlanOptions) -> PartTimes:
         (lambda: preview.rgb8(mosaic, 1.0, tone), mosaic.size),
         (lambda: completion(THOROUGH), tiles.size),
         (lambda: completion(QUICK), tiles.size),
+        (lamp, 1),
     )
     return PartTimes(*(np.array(_least_s(run) / pixels) for run, pixels in parts))
 

@@ -28,6 +28,7 @@ _BOUNDS: Final = {
     "tile_rows": (LEAST_PX, 16384),
     "tile_columns": (LEAST_PX, 16384),
     "network_views": (1, 4),
+    "lamps": (0, 1000),
     "workers": (1, 256),
 }
 
@@ -44,6 +45,7 @@ class PlanOptions:
             frame share a kernel.
         interpolation: with which sharp pictures are resampled onto the view.
         network_views: ways round in which the network of the tier ``accurate`` sees the picture, 1 to 4.
+        lamps: most pieces of clipped samples that the tier ``accurate`` tries as lamps; 0 to leave their halos.
         workers: threads where they save time.
 
     Raises:
@@ -58,6 +60,7 @@ class PlanOptions:
     tile_columns: int = 160
     interpolation: Interpolation = Interpolation.CUBIC
     network_views: int = 4
+    lamps: int = 24
     workers: int = 2
 
     def __post_init__(self) -> None:

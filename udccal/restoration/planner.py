@@ -98,6 +98,7 @@ def _timed(
         preview.view.rows * preview.view.columns,
         not profile.psf.unfitted,
         saturated(mosaic[layout.reach], preview.noise),
+        options.lamps,
     )
     times = part_times(options, keep)
     return tuple(TierForecast(tier, None, size.ms(tier, times)) for tier in Tier)

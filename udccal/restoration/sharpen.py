@@ -15,6 +15,7 @@ from udccal.restoration.blur import blurred
 from udccal.restoration.clipped import clipped_tiles, completed, effort_of
 from udccal.restoration.filter_tables import FilterTables, filter_tables
 from udccal.restoration.kernel_grid import KernelGrid
+from udccal.restoration.lamps import LampFinder, WithoutLamps
 from udccal.restoration.mosaic_filter import filtered_and_joined
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
@@ -126,6 +127,17 @@ class Sharpener:
         Returns:
             the picture in e-, of the rows that the layout covers.
         """
+        if self.tier is not Tier.accurate:
+            return self._sharp(signal_e, variance_e2, clipped)
+        dark = self.without_lamps(signal_e, variance_e2, clipped)
+        return dark.put_back(self._sharp(dark.signal_e, variance_e2, dark.clipped), self.layout.inner)
+
+    def without_lamps(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> WithoutLamps:
+        """Take lamps beyond the range off a frame, as the tier ``accurate`` does. Arguments are those of ``apply``."""
+        finder = LampFinder(self.grid, self.layout, self.tables, self.cfa, self.options.lamps)
+        return finder.without(signal_e, self._tile_noise(variance_e2), clipped)
+
+    def _sharp(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Strip:
         found = self.solved(signal_e, variance_e2, clipped)
         if self.noise is None:
             return found.picture
