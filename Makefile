@@ -9,6 +9,7 @@ ACCURACY_SEEDS ?= 8
 EFFICIENCY_OUT ?= efficiency
 PARETO_OUT ?= pareto
 BUDGET_OUT ?= budget
+LAMPS_OUT ?= lamps
 DRIFT_OUT ?= drift
 DRIFT_RIGS ?= 200
 RIGS_OUT ?= drawn
@@ -24,7 +25,7 @@ ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto full-size fewer device network budget drift other-days guided rigs live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto full-size fewer device network budget lamps drift other-days guided rigs live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -158,6 +159,11 @@ network: $(STAMP)
 budget: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.budget --out $(BUDGET_OUT)
 
+# Drawn frames with lamps beyond the range: what pictures gain where their halos are taken off. Writes lamps.json and
+# the table of docs/restoration.md; non-zero exit where a limit is missed.
+lamps: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.lamps --out $(LAMPS_OUT)
+
 # Ten minutes of `udccal run` with the simulated camera at 30 Hz. Writes live.json; non-zero exit where frames dropped,
 # latency or memory miss their limits. Nothing else should run meanwhile.
 live: $(STAMP)
@@ -173,4 +179,4 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(BUDGET_OUT) $(OTHER_DAYS_OUT) $(GUIDED_OUT) $(RIGS_OUT) $(LIVE_OUT) site peers build dist *.egg-info
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(BUDGET_OUT) $(LAMPS_OUT) $(OTHER_DAYS_OUT) $(GUIDED_OUT) $(RIGS_OUT) $(LIVE_OUT) site peers build dist *.egg-info
