@@ -161,6 +161,14 @@ def test_light_of_one_colour_is_no_lamp() -> None:
     np.testing.assert_array_equal(found.signal_e, seen)
 
 
+def test_a_range_that_the_panel_alone_fills_tells_nothing_of_a_lamp() -> None:
+    of, signal = finder(), np.zeros((ROWS, COLUMNS), np.float32)
+    clipped = np.zeros(signal.shape, dtype=bool)
+    clipped[LAMP], signal[LAMP] = True, -100.0
+    found = of.without(signal, noise_of(of), clipped)
+    np.testing.assert_array_equal(found.signal_e, signal)
+
+
 def test_no_piece_is_tried_where_none_is_asked_for_nor_in_a_frame_smaller_than_a_tile() -> None:
     of, clipped = finder(), np.zeros((ROWS, COLUMNS), dtype=bool)
     clipped[LAMP] = True

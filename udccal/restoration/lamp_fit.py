@@ -30,8 +30,9 @@ from udccal.restoration.mosaic_filter import Pattern, channels_of
 # Of a kernel, near the lamp: its relative error counts as noise where a halo is compared with a sample.
 _KERNEL_ERROR: Final = 0.03
 _STEPS, _MEMORY = 100, 30
-# Keeps equations solvable where two hidden samples are the same to the prior's precision.
-_RIDGE: Final = 1e-10
+# Keeps the equations solvable: of hidden samples, in units of their noise, a precision of nothing; of light that no
+# sample sees, its scale over the largest.
+_RIDGE, _UNSEEN = 1e-12, 1e-10
 
 Tile = Float64[np.ndarray, "rows columns"]
 Places = tuple[Int[np.ndarray, " _"], Int[np.ndarray, " _"]]
@@ -171,7 +172,7 @@ def lamp_light(
     """
     at, pixels, known = _places(hidden), _places(lamp), np.where(hidden, 0.0, samples)
     own = responses.between(responses.to_sample, at, at)
-    own[np.diag_indices_from(own)] *= 1 + _RIDGE
+    own[np.diag_indices_from(own)] += _RIDGE
     cross = np.concatenate(list(responses.between(responses.to_light, at, pixels)), axis=1)
     light = responses.between(responses.of_light, pixels, pixels)
     light = light.swapaxes(1, 2).reshape(2 * (start.size,))
@@ -218,7 +219,7 @@ def _not_negative(
 ) -> tuple[Float64[np.ndarray, " light"], float]:
     """Minimise u^T M u / 2 - b^T u and the excess of the halo, for light u that is not negative."""
     own = np.diag(matrix)
-    scale = np.sqrt(np.maximum(own, _RIDGE * own.max()))
+    scale = np.sqrt(np.maximum(own, _UNSEEN * own.max()))
     matrix, slope, halo = matrix / scale / scale[:, None], slope / scale, halo / scale
 
     def cost(light: np.ndarray) -> tuple[float, np.ndarray]:

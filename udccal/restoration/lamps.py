@@ -164,9 +164,11 @@ class LampFinder:
         known = [tile[~missing & (channel == colour)] for colour in range(len(noise_e))]
         if np.count_nonzero(hidden) > _MOST_HIDDEN or min(known[colour].size for colour in self._colours) == 0:
             return None
+        range_e = float(np.median(tile[piece.own & frame.clipped[piece.tile]]))
+        if range_e <= 0:  # the panel's light alone fills the range
+            return None
         level_e = np.array([np.median(each) if each.size else 0.0 for each in known])[channel]
         clean = np.where(missing, level_e, tile).astype(np.float32)
-        range_e = float(np.median(tile[piece.own & frame.clipped[piece.tile]]))
         light_e = np.full((len(self._colours), np.count_nonzero(piece.inside)), _WHITE * range_e)
         if before is not None:
             light_e = before.light_e
