@@ -97,11 +97,10 @@ class _Stages(eqx.Module):
 class DeviceRestorer:
     """A restorer whose tables lie on a device.
 
-    It shows what ``Restorer.display`` shows, but for rounding, and for halos of lamps, which stay at every tier. The first
-    frame takes the seconds of a compilation.
-    Three things are done another way. Every strength of a tile's prior is tried, not only those beside the best of
-    some. A tile where clipped samples are completed has no picture of its own before that. Whether a scene has dark
-    places is decided by all of its rows.
+    It shows what ``Restorer.display`` shows, but for rounding, and for halos of lamps, which stay at every tier. The
+    first frame takes the seconds of a compilation. Three things are done another way. Every strength of a tile's prior
+    is tried, not only those beside the best of some. A tile where clipped samples are completed has no picture of its
+    own before that. Whether a scene has dark places is decided by all of its rows.
 
     Attributes:
         restorer: as prepared. stages: what frames pass. panel: sums over the panel's pixels.
