@@ -49,6 +49,7 @@ class Lamp:
         piece: what clips.
         range_e: the light at which it clips.
         light_e: of its pixels, by colour of the pattern.
+        halo_e: this behind the kernel, in the colour of each sample of its tile.
         hidden: samples of its tile that were solved for with it.
         without_e: what they have without it.
         evidence: by how much it lowers twice the negative log likelihood.
@@ -57,6 +58,7 @@ class Lamp:
     piece: Piece
     range_e: float
     light_e: Float64[np.ndarray, "colours pixels"]
+    halo_e: Mosaic
     hidden: Clipped
     without_e: Float32[np.ndarray, " hidden"]
     evidence: float
@@ -139,7 +141,7 @@ class LampFinder:
             for number, piece in enumerate(pieces):
                 before = lamps.pop(number, None)
                 if after == 0 or before is not None:
-                    lamp = self._fitted(piece, before, self._halos(lamps.values(), signal_e.shape), frame)
+                    lamp = self._fitted(piece, before, _halos(lamps.values(), signal_e.shape), frame)
                     if lamp is not None and lamp.ratio > _HARDLY_ANY:
                         lamps[number] = lamp
         return self._taken_off([lamp for lamp in lamps.values() if lamp.found], signal_e, clipped)
@@ -172,7 +174,7 @@ class LampFinder:
         light_e = np.full((len(self._colours), np.count_nonzero(piece.inside)), _WHITE * range_e)
         if before is not None:
             light_e = before.light_e
-            clean -= np.where(missing, 0, self._halo(before))
+            clean -= np.where(missing, 0, before.halo_e)
             clean[before.hidden] = before.without_e
         kernel = int(self.layout.kernel[piece.index])
         tables = self.tables.at(kernel)
@@ -184,35 +186,31 @@ class LampFinder:
         unclipped = ~frame.clipped[piece.tile]
         found = lamp_light(rest, level_e / scale, hidden, unclipped, piece.inside, light_e / by_colour, responses)
         without_e = (found.hidden * scale[hidden] + level_e[hidden]).astype(np.float32)
-        return Lamp(piece, range_e, found.light * by_colour, hidden, without_e, found.evidence)
+        light_e = found.light * by_colour
+        return Lamp(piece, range_e, light_e, self._halo(piece, light_e), hidden, without_e, found.evidence)
 
     def _kernels(self, piece: Piece) -> Float32[np.ndarray, "channels ky kx"]:
         kernel = int(self.layout.kernel[piece.index])
         kernels: np.ndarray = interpolated_kernels(self.grid, self.layout.kernel_px[kernel : kernel + 1])[0]
         return kernels
 
-    def _halo(self, lamp: Lamp) -> Mosaic:
-        """Return a lamp's light behind its kernel, in the colour of each sample of its tile."""
-        channel, kernels = self.cfa.channel_map(*self._size), self._kernels(lamp.piece)
+    def _halo(self, piece: Piece, light_e: Float64[np.ndarray, "colours pixels"]) -> Mosaic:
+        """Return a piece's light behind its kernel, in the colour of each sample of its tile."""
+        channel, kernels = self.cfa.channel_map(*self._size), self._kernels(piece)
         halo = np.zeros(self._size, dtype=np.float32)
-        for colour, light in zip(self._colours, lamp.light_e, strict=True):
+        for colour, light in zip(self._colours, light_e, strict=True):
             sharp = np.zeros(self._size, dtype=np.float32)
-            sharp[lamp.piece.inside] = light
+            sharp[piece.inside] = light
             # A correlation, so the kernel is turned round.
             blurred = cv2.filter2D(sharp, -1, kernels[colour][::-1, ::-1], borderType=cv2.BORDER_CONSTANT)
             halo[channel == colour] = blurred[channel == colour]
         return halo
 
-    def _halos(self, lamps: Iterable[Lamp], shape: tuple[int, ...]) -> Mosaic:
-        total = np.zeros(shape, dtype=np.float32)
-        for lamp in lamps:
-            total[lamp.piece.tile] += self._halo(lamp)
-        return total
-
-    def _taken_off(self, lamps: list[Lamp], signal_e: Mosaic, clipped: Clipped) -> WithoutLamps:
+    @staticmethod
+    def _taken_off(lamps: list[Lamp], signal_e: Mosaic, clipped: Clipped) -> WithoutLamps:
         if not lamps:
             return WithoutLamps(signal_e, clipped, None)
-        rest, still = signal_e - self._halos(lamps, signal_e.shape), clipped.copy()
+        rest, still = signal_e - _halos(lamps, signal_e.shape), clipped.copy()
         white = np.zeros_like(signal_e)
         for lamp in lamps:
             piece, own = lamp.piece, lamp.piece.own[lamp.hidden]
@@ -239,6 +237,13 @@ class _Frame:
     clipped: Clipped
     hidden: Clipped
     untried: Clipped
+
+
+def _halos(lamps: Iterable[Lamp], shape: tuple[int, ...]) -> Mosaic:
+    total = np.zeros(shape, dtype=np.float32)
+    for lamp in lamps:
+        total[lamp.piece.tile] += lamp.halo_e
+    return total
 
 
 def _white(lamp: Lamp) -> Mosaic:
