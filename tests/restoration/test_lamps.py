@@ -140,6 +140,23 @@ def test_lamps_whose_halos_overlap_are_told_apart() -> None:
     assert left < before / 5
 
 
+def test_a_halo_that_reaches_beyond_the_lamps_tile_is_taken_off_there_too() -> None:
+    rows, cfa, y = 420, PATTERNS["RGGB"], np.abs(np.arange(-120, 121.0))[:, None]
+    kernel = np.exp(-(np.arange(-8, 9.0) ** 2) / 1.5) * (np.exp(-(y**2) / 3.0) + 0.02 * np.exp(-y / 60.0))
+    grid = KernelGrid(np.zeros(1), np.zeros(1), np.stack([kernel / kernel.sum()] * 3)[None, None].astype(np.float32))
+    layout = layout_for(rows, COLUMNS, (2, 2), (192, 160), (0, rows))
+    of = LampFinder(grid, layout, filter_tables(grid, layout, cfa, 2), cfa, 4)
+    light = np.full((rows, COLUMNS), SCENE_E)
+    light[205:212, 90:97] = 2.4e5
+    whole = (blurred(grid, 0, light) + np.random.default_rng(2).normal(0, NOISE_E, light.shape)).astype(np.float32)
+    found = of.without(np.minimum(whole, np.float32(RANGE_E)), noise_of(of), whole >= RANGE_E)
+    assert found.white_e is not None
+    for beyond in (np.s_[205 - 110 : 205 - 96, 90:97], np.s_[212 + 96 : 212 + 110, 90:97]):
+        before, after = (float(np.mean(each[beyond])) - SCENE_E for each in (whole, found.signal_e))
+        assert before > 3 * NOISE_E
+        assert abs(after) < before / 5
+
+
 @pytest.mark.parametrize(
     ("light", "where"),
     [
@@ -172,16 +189,16 @@ def test_a_range_that_the_panel_alone_fills_tells_nothing_of_a_lamp() -> None:
 def test_no_piece_is_tried_where_none_is_asked_for_nor_in_a_frame_smaller_than_a_tile() -> None:
     of, clipped = finder(), np.zeros((ROWS, COLUMNS), dtype=bool)
     clipped[LAMP] = True
-    assert len(lamp_pieces(clipped, of.layout, 1)) == 1
-    assert lamp_pieces(clipped, of.layout, 0) == []
-    assert lamp_pieces(clipped[: of.layout.rows - 2], of.layout, 1) == []
+    assert len(lamp_pieces(clipped, of.layout, 1, 129)) == 1
+    assert lamp_pieces(clipped, of.layout, 0, 129) == []
+    assert lamp_pieces(clipped[: of.layout.rows - 2], of.layout, 1, 129) == []
 
 
 def test_the_largest_pieces_are_tried_and_lie_in_tiles_of_their_own() -> None:
     of, clipped = finder(), np.zeros((ROWS, COLUMNS), dtype=bool)
     for size, (y, x) in ((6, (4, 6)), (8, (100, 90)), (7, (200, 180))):
         clipped[y : y + size, x : x + size] = True
-    found = lamp_pieces(clipped, of.layout, 2)
+    found = lamp_pieces(clipped, of.layout, 2, 129)
     assert [piece.area for piece in found] == [64, 49]
     for piece in found:
         assert piece.tile[0].stop <= ROWS

@@ -25,7 +25,7 @@ from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.lamp_fit import Responses, lamp_light
-from udccal.restoration.lamp_pieces import hidden_samples, lamp_pieces
+from udccal.restoration.lamp_pieces import hidden_samples
 from udccal.restoration.lamps import ROUNDS
 from udccal.restoration.linear import to_electrons, variance_e2
 from udccal.restoration.mosaic_filter import filtered_and_joined
@@ -107,7 +107,7 @@ class FrameSize:
         view_px: int,
         blurred: bool,
         clipped: Bool[np.ndarray, "strip_rows columns"],
-        most_lamps: int,
+        lamps: int,
     ) -> FrameSize:
         """Return the size of a frame in the tiles of ``layout``; ``clipped`` are samples of the rows ``reach``."""
         of_tile = layout.rows * layout.columns
@@ -117,7 +117,7 @@ class FrameSize:
         covered_px = int(np.prod(layout.covered))
         if not blurred:
             return cls(strip_px, covered_px, view_px, 0, 0, 0)
-        return cls(strip_px, covered_px, view_px, tile_px, clipped_px, len(lamp_pieces(clipped, layout, most_lamps)))
+        return cls(strip_px, covered_px, view_px, tile_px, clipped_px, lamps)
 
     def ms(self, tier: Tier, times: PartTimes) -> float:
         """Return the milliseconds from a raw frame to a picture of 8 bits at a tier."""

@@ -13,13 +13,14 @@ from udccal.restoration.tiles import TileLayout
 
 # A piece has so many samples at least: smaller ones have little light, and edges of a picture are taken for it.
 _LEAST: Final = 24
-# How far its middle is from its rim. A thin line may be anything.
-_SMALLEST_PX, _LARGEST_PX = 2.0, 8.0
+# How far its middle is from its rim: at least, for a thin line may be anything; and at most, or so much of the kernel's
+# rows where that is more: a halo that reaches far tells of more.
+_SMALLEST_PX, _LARGEST_PX, _LARGEST = 2.0, 8.0, 1 / 16
 # Samples as near to a piece as this are hidden; its light lies this deep in it, or as deep as there is.
 _RIM_PX, _INSIDE_PX = 3, 1.5
 _RIM: Final = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _RIM_PX + 1, 2 * _RIM_PX + 1))
 # Pixels that may have light: the time of a fit grows with their cube.
-_MOST_PIXELS: Final = 500
+_MOST_PIXELS: Final = 700
 
 Mask = Bool[np.ndarray, "rows columns"]
 
@@ -49,20 +50,21 @@ def hidden_samples(clipped: Mask) -> Mask:
     return cv2.dilate(_whole(clipped), _RIM) > 0
 
 
-def lamp_pieces(clipped: Mask, layout: TileLayout, most: int) -> list[Piece]:
+def lamp_pieces(clipped: Mask, layout: TileLayout, most: int, kernel_rows: int) -> list[Piece]:
     """Return at most so many pieces that may be lamps, the largest first; none of a frame smaller than a tile.
 
     Args:
         clipped: samples that say less than their light was, of the frame's rows ``layout.reach``.
         layout: the tiles.
         most: number of pieces.
+        kernel_rows: of the kernels: how far a halo reaches.
     """
     size = layout.rows, layout.columns
     if most == 0 or np.count_nonzero(clipped) < _LEAST or min(np.subtract(clipped.shape, size)) < 0:
         return []
     whole = _whole(clipped)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(whole, connectivity=8)
-    depth = _depth(whole)
+    depth, largest = _depth(whole), max(_LARGEST_PX, _LARGEST * kernel_rows)
     found: list[Piece] = []
     for label in sorted(range(1, count), key=lambda one: -int(boxes[one, cv2.CC_STAT_AREA])):
         left, top, columns, rows, area = (int(value) for value in boxes[label])
@@ -73,7 +75,7 @@ def lamp_pieces(clipped: Mask, layout: TileLayout, most: int) -> list[Piece]:
         deepest = float(depth[box][own].max())
         inside = own & (depth[box] > min(_INSIDE_PX, deepest - 0.5))
         large = 2 * rows > size[0] or 2 * columns > size[1]
-        if _SMALLEST_PX <= deepest <= _LARGEST_PX and not large and np.count_nonzero(inside) <= _MOST_PIXELS:
+        if _SMALLEST_PX <= deepest <= largest and not large and np.count_nonzero(inside) <= _MOST_PIXELS:
             found.append(_piece(box, own, inside, clipped.shape, layout))
     return found
 

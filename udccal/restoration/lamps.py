@@ -49,7 +49,8 @@ class Lamp:
         piece: what clips.
         range_e: the light at which it clips.
         light_e: of its pixels, by colour of the pattern.
-        halo_e: this behind the kernel, in the colour of each sample of its tile.
+        window: rows and columns of the strip that its halo reaches.
+        halo_e: its light behind the kernel, in the colour of each sample there.
         hidden: samples of its tile that were solved for with it.
         without_e: what they have without it.
         evidence: by how much it lowers twice the negative log likelihood.
@@ -58,7 +59,8 @@ class Lamp:
     piece: Piece
     range_e: float
     light_e: Float64[np.ndarray, "colours pixels"]
-    halo_e: Mosaic
+    window: tuple[slice, slice]
+    halo_e: Float32[np.ndarray, "high wide"]
     hidden: Clipped
     without_e: Float32[np.ndarray, " hidden"]
     evidence: float
@@ -128,7 +130,7 @@ class LampFinder:
             noise_e: sigma of a sample of each colour in each tile.
             clipped: samples whose light was more than they say.
         """
-        pieces = lamp_pieces(clipped, self.layout, self.most)
+        pieces = lamp_pieces(clipped, self.layout, self.most, self.grid.kernels.shape[-2])
         if not pieces:
             return WithoutLamps(signal_e, clipped, None)
         hidden = hidden_samples(clipped)
@@ -174,7 +176,7 @@ class LampFinder:
         light_e = np.full((len(self._colours), np.count_nonzero(piece.inside)), _WHITE * range_e)
         if before is not None:
             light_e = before.light_e
-            clean -= np.where(missing, 0, before.halo_e)
+            clean -= np.where(missing, 0, _halos([before], frame.signal_e.shape)[piece.tile])
             clean[before.hidden] = before.without_e
         kernel = int(self.layout.kernel[piece.index])
         tables = self.tables.at(kernel)
@@ -187,24 +189,33 @@ class LampFinder:
         found = lamp_light(rest, level_e / scale, hidden, unclipped, piece.inside, light_e / by_colour, responses)
         without_e = (found.hidden * scale[hidden] + level_e[hidden]).astype(np.float32)
         light_e = found.light * by_colour
-        return Lamp(piece, range_e, light_e, self._halo(piece, light_e), hidden, without_e, found.evidence)
+        halo = self._halo(piece, light_e, frame.signal_e.shape)
+        return Lamp(piece, range_e, light_e, *halo, hidden, without_e, found.evidence)
 
     def _kernels(self, piece: Piece) -> Float32[np.ndarray, "channels ky kx"]:
         kernel = int(self.layout.kernel[piece.index])
         kernels: np.ndarray = interpolated_kernels(self.grid, self.layout.kernel_px[kernel : kernel + 1])[0]
         return kernels
 
-    def _halo(self, piece: Piece, light_e: Float64[np.ndarray, "colours pixels"]) -> Mosaic:
-        """Return a piece's light behind its kernel, in the colour of each sample of its tile."""
-        channel, kernels = self.cfa.channel_map(*self._size), self._kernels(piece)
-        halo = np.zeros(self._size, dtype=np.float32)
+    def _halo(
+        self, piece: Piece, light_e: Float64[np.ndarray, "colours pixels"], shape: tuple[int, ...]
+    ) -> tuple[tuple[slice, slice], Float32[np.ndarray, "high wide"]]:
+        """Return a piece's light behind its kernel, in the colour of each sample, and where it reaches."""
+        kernels = self._kernels(piece)
+        down, across = (
+            slice(max(part.start - size // 2, 0), min(part.stop + size // 2, most))
+            for part, size, most in zip(piece.tile, kernels.shape[1:], shape, strict=True)
+        )
+        channel = self.cfa.channel_map(*shape)[down, across]
+        sharp, halo = (np.zeros(channel.shape, dtype=np.float32) for _ in range(2))
+        row, column = np.nonzero(piece.inside)
+        at = row + piece.tile[0].start - down.start, column + piece.tile[1].start - across.start
         for colour, light in zip(self._colours, light_e, strict=True):
-            sharp = np.zeros(self._size, dtype=np.float32)
-            sharp[piece.inside] = light
+            sharp[at] = light
             # A correlation, so the kernel is turned round.
             blurred = cv2.filter2D(sharp, -1, kernels[colour][::-1, ::-1], borderType=cv2.BORDER_CONSTANT)
             halo[channel == colour] = blurred[channel == colour]
-        return halo
+        return (down, across), halo
 
     @staticmethod
     def _taken_off(lamps: list[Lamp], signal_e: Mosaic, clipped: Clipped) -> WithoutLamps:
@@ -242,7 +253,7 @@ class _Frame:
 def _halos(lamps: Iterable[Lamp], shape: tuple[int, ...]) -> Mosaic:
     total = np.zeros(shape, dtype=np.float32)
     for lamp in lamps:
-        total[lamp.piece.tile] += lamp.halo_e
+        total[lamp.window] += lamp.halo_e
     return total
 
 

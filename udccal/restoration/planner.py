@@ -9,10 +9,12 @@ from jaxtyping import UInt8, UInt16
 
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
+from udccal.kernels import fitted_size
 from udccal.profiles.profile import Profile
 from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.forecast import expected_error
 from udccal.restoration.frame_time import FrameSize, part_times
+from udccal.restoration.lamp_pieces import lamp_pieces
 from udccal.restoration.linear import saturated
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.scene_plan import ScenePlan, TierForecast, Wish, chosen_tier
@@ -93,12 +95,10 @@ def _timed(
     cfa = cfa_named(camera.cfa)
     largest = options.tile_rows, options.tile_columns
     layout = layout_for(camera.rows, camera.columns, (cfa.rows, cfa.columns), largest, preview.rectification.rows)
-    size = FrameSize.of(
-        layout,
-        preview.view.rows * preview.view.columns,
-        not profile.psf.unfitted,
-        saturated(mosaic[layout.reach], preview.noise),
-        options.lamps,
-    )
+    clipped = saturated(mosaic[layout.reach], preview.noise)
+    kernel_rows, _ = fitted_size(profile.psf.term, profile.rig, options.kernel_rows, options.kernel_columns)
+    lamps = len(lamp_pieces(clipped, layout, options.lamps, kernel_rows))
+    view_px = preview.view.rows * preview.view.columns
+    size = FrameSize.of(layout, view_px, not profile.psf.unfitted, clipped, lamps)
     times = part_times(options, keep)
     return tuple(TierForecast(tier, None, size.ms(tier, times)) for tier in Tier)
