@@ -79,6 +79,12 @@ def test_a_mistake_is_told_with_what_was_found(tmp_path: Path, right: str, wrong
         load_rig(tmp_path)
 
 
+def test_a_byte_order_mark_is_no_mistake(tmp_path: Path) -> None:
+    text = (find_rig("lg55-reduced") / "rig.toml").read_text(encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(text, encoding="utf-8-sig")
+    assert load_rig(tmp_path) == load_rig("lg55-reduced")
+
+
 def test_a_number_where_a_section_belongs_is_refused(tmp_path: Path) -> None:
     text = (find_rig("lg55-reduced") / "rig.toml").read_text(encoding="utf-8")
     (tmp_path / "rig.toml").write_text("lens = 3\n" + text.replace("[lens]", "[other]"), encoding="utf-8")

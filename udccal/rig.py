@@ -211,7 +211,7 @@ def load_rig(name_or_path: str | Path) -> RigDescription:
     if len(raw) > _MAX_TOML_BYTES:
         raise RigError(f"Expected {file} to hold at most {_MAX_TOML_BYTES} bytes, found {len(raw)}. Shorten it.")
     try:
-        return RigDescription.model_validate(tomllib.loads(raw.decode("utf-8")))
+        return RigDescription.model_validate(tomllib.loads(raw.decode("utf-8-sig")))
     except RecursionError as error:
         raise RigError(f"Expected {file} to be a rig, found lists inside lists without end. Correct it.") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -75,6 +75,11 @@ def test_a_tone_of_electrons_is_none_that_is_refused(exposure: float) -> None:
     assert np.isfinite(Tone(exposure, (1e6, 1.0, 1.0)).of_electrons(1e-9).scale()).all()
 
 
+def test_an_empty_picture_is_refused() -> None:
+    with pytest.raises(RestorationError, match="Expected a picture, found one of 4 x 0 px"):
+        Tone(1.0).rgb8(np.zeros((0, 4, 3), np.float32))
+
+
 def test_light_far_beyond_white_is_white() -> None:
     linear = np.array([[[1.0, 1e5, 1e30], [0.0, -1.0, 0.5]]], np.float32)
     tone = Tone(3.0)

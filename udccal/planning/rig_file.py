@@ -40,7 +40,7 @@ def write_planned_rig(rig_name: str | Path, captures: Captures, path: Path) -> N
     """
     check_absent(path)
     source = find_rig(rig_name) / RIG_FILE
-    text = source.read_text(encoding="utf-8")
+    text = source.read_text(encoding="utf-8-sig")
     numbers = "".join(f"{name} = {value!r}\n" for name, value in captures.model_dump().items())
     planned, found = _SECTION.subn(f"[captures]\n{numbers}", text, count=1)
     if not found:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 from typing import Any
 
@@ -269,4 +270,7 @@ def test_a_pixel_on_which_no_ray_lands_has_no_sigma() -> None:
     found = fit_geometry(*arrays()[:2], SCENE.size)
     with pytest.raises(FitError, match="distortion folds"):
         projection_sigma_px(found, np.array([[1e5, 1e5]]))
+    with pytest.raises(FitError, match="Expected a FitResult, found"):
+        # Programs do not have the tests' own check of types.
+        inspect.unwrap(projection_sigma_px)(found.term, np.array([[160.0, 120.0]]))
     assert np.isfinite(projection_sigma_px(found, np.array([[160.0, 120.0]]))).all()

@@ -155,9 +155,11 @@ def projection_sigma_px(
         one sigma in px along x and along y, per pixel; errors as for ``FitResult.sigma_of``.
 
     Raises:
-        FitError: when the fitted distortion folds before a pixel, so that no direction appears there, or pixels are
-            none on a sensor.
+        FitError: when the fitted distortion folds before a pixel, so that no direction appears there, pixels are none
+            on a sensor, or ``result`` is neither.
     """
+    if not isinstance(result, Posterior):
+        check_kind(result, FitResult, "Give the result of fit_boards or fit_geometry.", FitError)
     check_positions(pixels, "n", "Give (x, y) in px where directions appear.", FitError)
     directions, places = jax.jit(panel_directions)(result.term, pixels), jax.jit(project_directions)
     lost = ~(np.abs(np.asarray(places(result.term, directions)) - pixels).max(axis=1) < _ROUNDING_PX)
