@@ -67,7 +67,9 @@ class Tone:
         advice = "Give a restored picture."
         check_array(linear, "a picture", "real numbers", ("rows", "columns", 3), advice, RestorationError)
         if linear.size == 0:
-            raise RestorationError(f"Expected a picture, found one of {linear.shape[1]} x {linear.shape[0]} px. {advice}")
+            raise RestorationError(
+                f"Expected a picture, found one of {linear.shape[1]} x {linear.shape[0]} px. {advice}"
+            )
         # Rounded, and clipped at both ends; beyond the range of 32-bit integers the product would be 0.
         # Reading the picture for its largest value takes a third of the time of a bounded copy, which few need.
         most = 1e4 / max(float(self.scale().max()), 1e-30)
