@@ -137,12 +137,18 @@ class Budget:
     """The rig as it is and as its profile says, and scenes restored with parts of either."""
 
     def __init__(
-        self, truth: RigTruth, blur: FullBlur, restorer: Restorer, panel: PanelLight, kernels: KernelGrid
+        self,
+        truth: RigTruth,
+        blur: FullBlur,
+        restorer: Restorer,
+        panel: PanelLight,
+        kernels: KernelGrid,
+        wire: Float32[np.ndarray, "rows columns"],
     ) -> None:
         camera = truth.description.camera
         self._truth, self._blur, self._restorer, self._panel = truth, blur, restorer, panel
         self._size, self._cfa = (camera.rows, camera.columns), cfa_named(camera.cfa)
-        self._wire = wire_map(truth).astype(np.float32)
+        self._wire, self._stated_wire = wire_map(truth).astype(np.float32), wire
         true = true_kernels(blur)
         nodes = np.stack(np.meshgrid(kernels.x_px, kernels.y_px), axis=-1).reshape(-1, 2)
         shape = len(kernels.y_px), len(kernels.x_px)
@@ -192,7 +198,7 @@ class Budget:
             signal = signal + np.sqrt(variance) * rng.standard_normal(signal.shape, dtype=np.float32)
         if known.range:
             signal = np.minimum(signal, np.float32(self._truth.sensor.full_well_e))
-        wire = own.wire if known.wire and own.wire is not None else self._wire
+        wire = self._stated_wire if known.wire else self._wire
         light = signal / wire[..., None] - (view.stated_e if known.backscatter else view.panel_e)
         return self._filter(known).restored(light, variance / wire[..., None] ** 2)
 
@@ -253,7 +259,8 @@ def main() -> int:
     blur = build_full_blur(truth, *BLUR_GRID, captures.psf_region_rows + 1, captures.psf_region_columns + 1)
     restorer = Restorer.from_profile(profile, Tier.balanced)
     panel = PanelLight.of(profile.backscatter.term, profile.rig)
-    budget = Budget(truth, blur, restorer, panel, kernel_grid(profile.psf.term, profile.rig, plan))
+    kernels, wire = kernel_grid(profile.psf.term, profile.rig, plan), profile.wire_map
+    budget = Budget(truth, blur, restorer, panel, kernels, np.asarray(wire, dtype=np.float32))
     bench, scenes = PictureBench(truth, blur, restorer), list(shared_scenes(data, options.every))
     shots = bench.shots(scenes)
     light, found = bench.matched_room_light(shots), dict[str, dict[str, float]]()
