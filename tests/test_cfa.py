@@ -53,3 +53,8 @@ def test_a_sensor_without_colours_is_grey() -> None:
 def test_other_words_are_refused(bad: str) -> None:
     with pytest.raises(ValueError, match=r"one of the CFA patterns mono, RGGB, .*, found"):
         cfa_named(bad)
+
+
+def test_a_sensor_without_colours_has_one_channel() -> None:
+    assert PATTERNS["GBRG"].colours == (0, 1, 2)
+    assert PATTERNS["mono"].colours == (1,)

@@ -73,6 +73,11 @@ class Cfa:
         """Channel of each site."""
         return np.array([site.channel for site in self.sites]).reshape(self.rows, self.columns)
 
+    @property
+    def colours(self) -> tuple[int, ...]:
+        """Channels that the pattern has: one of a sensor without colours."""
+        return tuple(sorted({site.channel for site in self.sites}))
+
     def channel_map(self, rows: int, columns: int) -> Int[np.ndarray, "rows columns"]:
         """Channel of every sample of a mosaic of that size."""
         return self._repeated(self.channels, rows, columns)

@@ -22,13 +22,10 @@ from tests.benchmarks.rows import Row, at_least, table, write_json
 from tests.benchmarks.scenes import linear_photograph
 from udccal.cfa import PATTERNS, Cfa
 from udccal.profiles.store import load_profile
-from udccal.restoration.filter_tables import filter_tables
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.metrics import encode_srgb, psnr
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.sharpen import Sharpener
-from udccal.restoration.shrink import measured_noise
-from udccal.restoration.tiles import layout_for
 from udccal.rig import RigDescription, load_rig
 from udccal.tiers import Tier
 
@@ -122,27 +119,22 @@ def gained(drawn: Drawn, rig: RigDescription) -> Gained:
     """Restore a frame twice with the filters of the tier ``balanced``."""
     camera = rig.camera.model_copy(update={"rows": ROWS, "columns": COLUMNS, "cfa": drawn.cfa.name})
     grid = KernelGrid(np.zeros(1), np.zeros(1), drawn.known[None, None].astype(np.float32))
-    options, cfa = PlanOptions(), drawn.cfa
-    size = options.tile_rows, options.tile_columns
-    layout = layout_for(ROWS, COLUMNS, (cfa.rows, cfa.columns), size, (0, ROWS))
-    tables = filter_tables(grid, layout, cfa, options.workers)
-    noise = measured_noise(tables, layout, cfa, options.workers)
     rig = rig.model_copy(update={"camera": camera})
-    sharpener = Sharpener(Tier.balanced, grid, rig, layout, tables, noise, options)
+    sharpener = Sharpener.of(grid, rig, (0, ROWS), Tier.balanced, PlanOptions())
     seen = np.minimum(drawn.mosaic, np.float32(drawn.range_e))
     variance, clipped = np.maximum(seen, 0) + np.float32(_READ_E**2), seen >= drawn.range_e
     found = sharpener.without_lamps(seen, variance, clipped)
     left = sharpener.apply(seen, variance, clipped)
     if found.white_e is None:
         return Gained(_dB(left, drawn), _dB(left, drawn), False)
-    off = found.put_back(sharpener.apply(found.signal_e, variance, found.clipped), layout.inner)
+    off = found.put_back(sharpener.apply(found.signal_e, variance, found.clipped), sharpener.layout.inner)
     return Gained(_dB(left, drawn), _dB(off, drawn), True)
 
 
 def _dB(picture: Rgb, drawn: Drawn) -> float:
     """PSNR as displayed; white is the scene's 97th percentile, or the range."""
     white = min(float(np.percentile(drawn.scene, 97)), drawn.range_e)
-    colours = sorted(set(drawn.cfa.channels.ravel().tolist()))
+    colours = list(drawn.cfa.colours)
     return psnr(encode_srgb(picture[..., colours] / white), encode_srgb(drawn.scene[..., colours] / white))
 
 

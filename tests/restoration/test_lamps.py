@@ -29,7 +29,7 @@ BESIDE = np.s_[60:150, 80:110]
 
 
 @cache
-def finder(name: str = "RGGB", most: int = 24) -> LampFinder:
+def finder(name: str = "RGGB") -> LampFinder:
     """A kernel with a core, and a tail down the columns that holds a fifth of its light."""
     y, x = np.mgrid[-40:41, -8:9]
     kernel = np.exp(-(x**2) / 1.5 - y**2 / 3.0)
@@ -38,27 +38,27 @@ def finder(name: str = "RGGB", most: int = 24) -> LampFinder:
     grid = KernelGrid(np.zeros(1), np.zeros(1), np.stack([kernel] * 3)[None, None].astype(np.float32))
     cfa = PATTERNS[name]
     layout = layout_for(ROWS, COLUMNS, (cfa.rows, cfa.columns), (192, 160), (0, ROWS))
-    return LampFinder(grid, layout, filter_tables(grid, layout, cfa, 2), cfa, most)
+    return LampFinder(grid, layout, filter_tables(grid, layout, cfa, 2), cfa, 24)
 
 
-def scene(seed: int = 0) -> np.ndarray:
+def scene() -> np.ndarray:
     """Waves and a step, in all colours."""
     y, x = np.mgrid[:ROWS, :COLUMNS]
-    wave, shift = np.random.default_rng(seed).uniform(6.0, 12.0, 2)
+    wave, shift = np.random.default_rng(0).uniform(6.0, 12.0, 2)
     light = SCENE_E * (1 + 0.2 * np.sin(x / wave + y / shift) + 0.3 * (y > 130))
     return np.stack([light, 0.9 * light, 0.7 * light], axis=-1)
 
 
-def lit(light_e: tuple[float, float, float], where: tuple[slice, slice] = LAMP, seed: int = 0) -> np.ndarray:
-    light = scene(seed)
+def lit(light_e: tuple[float, float, float], where: tuple[slice, slice] = LAMP) -> np.ndarray:
+    light = scene()
     light[where] = light_e
     return light
 
 
-def mosaic_of(light: np.ndarray, cfa: Cfa, seed: int = 1) -> np.ndarray:
+def mosaic_of(light: np.ndarray, cfa: Cfa) -> np.ndarray:
     planes = np.stack([blurred(finder().grid, channel, light[..., channel]) for channel in range(3)], axis=-1)
     own = np.take_along_axis(planes, cfa.channel_map(ROWS, COLUMNS)[..., None], axis=2)[..., 0]
-    return (own + np.random.default_rng(seed).normal(0, NOISE_E, own.shape)).astype(np.float32)
+    return (own + np.random.default_rng(1).normal(0, NOISE_E, own.shape)).astype(np.float32)
 
 
 def noise_of(of: LampFinder) -> np.ndarray:

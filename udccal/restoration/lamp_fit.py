@@ -23,9 +23,9 @@ from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
+from udccal.cfa import Cfa
 from udccal.restoration.filter_tables import FilterTables
 from udccal.restoration.kernel_grid import centred
-from udccal.restoration.mosaic_filter import Pattern, channels_of
 
 # Of a kernel, near the lamp: its relative error counts as noise where a halo is compared with a sample.
 _KERNEL_ERROR: Final = 0.03
@@ -44,18 +44,16 @@ class Responses:
     """What the precision P answers, anywhere in a tile.
 
     Attributes:
-        pattern: the colour pattern.
-        channels: colours that it has.
+        cfa: the colour pattern.
         channel: colour of each sample of a tile.
-        transfer: spectrum of each of these colours' kernel.
+        transfer: spectrum of the kernel of each of its colours.
         vectors, weights: P in the coordinates of ``FilterTables``.
         to_sample: P, from a sample at each place of the cell.
         to_light: P T, from a pixel's light of each colour at each place of the cell, at the samples.
         of_light: T^T P T, the same at the pixels, by the colour there and the colour of the light.
     """
 
-    pattern: Pattern
-    channels: tuple[int, ...]
+    cfa: Cfa
     channel: Int[np.ndarray, "rows columns"]
     transfer: np.ndarray
     vectors: np.ndarray
@@ -70,7 +68,7 @@ class Responses:
         tables: FilterTables,
         strength: np.float32,
         kernels: Float[np.ndarray, "channels ky kx"],
-        pattern: Pattern,
+        cfa: Cfa,
         size: tuple[int, int],
     ) -> Responses:
         """Compute them.
@@ -79,24 +77,21 @@ class Responses:
             tables: of the tile's kernel.
             strength: of the tile's prior.
             kernels: of the tile, by channel.
-            pattern: the colour pattern.
+            cfa: the colour pattern.
             size: (rows, columns) of a tile.
         """
-        cell = pattern.rows, pattern.columns
-        of_site = channels_of(pattern)
-        channel = np.tile(of_site.reshape(cell), (size[0] // cell[0], size[1] // cell[1]))
-        channels = tuple(sorted(set(of_site.tolist())))
-        transfer = np.array([fft.rfft2(centred(kernels[colour], *size)) for colour in channels])
+        cell, count = (cfa.rows, cfa.columns), len(cfa.colours)
+        transfer = np.array([fft.rfft2(centred(kernels[colour], *size)) for colour in cfa.colours])
         # Eliminating hidden samples cancels nearly all of the equations: single precision would leave noise.
         vectors, weights = tables.vectors.astype(complex), 1 / (tables.values.astype(float) * strength + 1)
-        empty = (np.empty(shape + cell + size) for shape in ((), (len(channels),), (len(channels),) * 2))
-        made = cls(pattern, channels, channel, transfer, vectors, weights, *empty)
+        empty = (np.empty(shape + cell + size) for shape in ((), (count,), (count, count)))
+        made = cls(cfa, cfa.channel_map(*size), transfer, vectors, weights, *empty)
         for place in np.ndindex(cell):
             one = np.zeros(size)
             one[place] = 1.0
             made.to_sample[place] = made.precision(one)
-            for index in range(len(channels)):
-                light = np.zeros((len(channels), *size))
+            for index in range(count):
+                light = np.zeros((count, *size))
                 light[(index, *place)] = 1.0
                 made.to_light[(index, *place)] = made.precision(made.blurred(light))
                 made.of_light[(slice(None), index, *place)] = made.gathered(made.to_light[(index, *place)])
@@ -104,22 +99,22 @@ class Responses:
 
     def precision(self, samples: Tile) -> Tile:
         """Return P Y."""
-        planes = np.stack([samples[site.samples] for site in self.pattern.sites])
+        planes = np.stack([samples[site.samples] for site in self.cfa.sites])
         along = np.conj((self.vectors * fft.rfft2(planes)).sum(axis=1)) * self.weights
         solved = fft.irfft2(np.conj((self.vectors.swapaxes(0, 1) * along).sum(axis=1)), s=planes.shape[1:])
         result = np.empty(samples.shape)
-        for site, plane in zip(self.pattern.sites, solved, strict=True):
+        for site, plane in zip(self.cfa.sites, solved, strict=True):
             result[site.samples] = plane
         return result
 
     def blurred(self, light: Float64[np.ndarray, "colours rows columns"]) -> Tile:
         """Return T u, of the light of every pixel of a tile."""
         planes = fft.irfft2(fft.rfft2(light) * self.transfer, s=self.channel.shape)
-        return np.select([self.channel == colour for colour in self.channels], list(planes))
+        return np.select([self.channel == colour for colour in self.cfa.colours], list(planes))
 
     def gathered(self, samples: Tile) -> Float64[np.ndarray, "colours rows columns"]:
         """Return T^T Y."""
-        own = np.stack([np.where(self.channel == colour, samples, 0.0) for colour in self.channels])
+        own = np.stack([np.where(self.channel == colour, samples, 0.0) for colour in self.cfa.colours])
         found: Float64[np.ndarray, "colours rows columns"] = fft.irfft2(
             fft.rfft2(own) * np.conj(self.transfer), s=samples.shape
         )
@@ -128,7 +123,7 @@ class Responses:
     def between(self, responses: np.ndarray, to: Places, source: Places) -> np.ndarray:
         """Return the responses at some places of a tile to others, as (..., to, source)."""
         rows, columns = self.channel.shape
-        down, across = source[0] % self.pattern.rows, source[1] % self.pattern.columns
+        down, across = source[0] % self.cfa.rows, source[1] % self.cfa.columns
         row, column = (down + to[0][:, None] - source[0]) % rows, (across + to[1][:, None] - source[1]) % columns
         found: np.ndarray = responses[..., down, across, row, column]
         return found
@@ -140,7 +135,7 @@ class LampLight:
     """What one lamp's fit gives.
 
     Attributes:
-        light: of its pixels, by colour of ``Responses.channels``, in units of the colour's noise.
+        light: of its pixels, by colour of the pattern, in units of the colour's noise.
         hidden: what the hidden samples would have without the lamp, less their level, in units of their noise.
         evidence: by how much the lamp lowers twice the negative log likelihood of the tile's other samples.
     """
@@ -183,7 +178,7 @@ def lamp_light(
     halo, most = _limits(samples + level, hidden & unclipped, pixels, responses)
     found, evidence = _not_negative((matrix + matrix.T) / 2, slope, halo, most, start.ravel())
     # What was eliminated has the lamp's own light, too.
-    lit = np.zeros((len(responses.channels), *samples.shape))
+    lit = np.zeros((len(start), *samples.shape))
     lit[:, pixels[0], pixels[1]] = found.reshape(start.shape)
     rest = solved[:, 1:] @ found - solved[:, 0] - responses.blurred(lit)[at]
     return LampLight(found.reshape(start.shape), rest, evidence)
@@ -204,7 +199,7 @@ def _limits(
     channel = responses.channel[at]
     parts = [
         np.where((channel == colour)[:, None], kernel[row, column], 0.0)
-        for colour, kernel in zip(responses.channels, kernels, strict=True)
+        for colour, kernel in zip(responses.cfa.colours, kernels, strict=True)
     ]
     sigma = np.hypot(1.0, _KERNEL_ERROR * np.maximum(samples[at], 0.0))
     return np.concatenate(parts, axis=1) / sigma[:, None], samples[at] / sigma + 1.0

@@ -152,10 +152,6 @@ class LampFinder:
     def _size(self) -> tuple[int, int]:
         return self.layout.rows, self.layout.columns
 
-    @property
-    def _colours(self) -> list[int]:
-        return sorted(set(self.cfa.channels.ravel().tolist()))
-
     def _fitted(self, piece: Piece, before: Lamp | None, others: Mosaic, frame: _Frame) -> Lamp | None:
         """Fit a piece's light, the others' halos taken off; None where too much around it is hidden."""
         tile, missing = frame.signal_e[piece.tile] - others[piece.tile], frame.hidden[piece.tile]
@@ -164,44 +160,44 @@ class LampFinder:
         # Halos of what is too large to be tried would count as the piece's.
         if np.count_nonzero(frame.untried[piece.tile] & near) > np.count_nonzero(piece.own):
             return None
-        channel, noise_e = self.cfa.channel_map(*self._size), frame.noise_e[piece.index]
+        channel, colours = self.cfa.channel_map(*self._size), list(self.cfa.colours)
+        noise_e = frame.noise_e[piece.index]
         known = [tile[~missing & (channel == colour)] for colour in range(len(noise_e))]
-        if np.count_nonzero(hidden) > _MOST_HIDDEN or min(known[colour].size for colour in self._colours) == 0:
+        if np.count_nonzero(hidden) > _MOST_HIDDEN or min(known[colour].size for colour in colours) == 0:
             return None
         range_e = float(np.median(tile[piece.own & frame.clipped[piece.tile]]))
         if range_e <= 0:  # the panel's light alone fills the range
             return None
         level_e = np.array([np.median(each) if each.size else 0.0 for each in known])[channel]
         clean = np.where(missing, level_e, tile).astype(np.float32)
-        light_e = np.full((len(self._colours), np.count_nonzero(piece.inside)), _WHITE * range_e)
+        light_e = np.full((len(colours), np.count_nonzero(piece.inside)), _WHITE * range_e)
         if before is not None:
             light_e = before.light_e
             clean -= np.where(missing, 0, _halos([before], frame.signal_e.shape)[piece.tile])
             clean[before.hidden] = before.without_e
         kernel = int(self.layout.kernel[piece.index])
-        tables = self.tables.at(kernel)
+        tables, px = self.tables.at(kernel), self.layout.kernel_px[kernel : kernel + 1]
+        kernels: np.ndarray = interpolated_kernels(self.grid, px)[0]
         strength = likeliest_strength(clean, noise_e, tables, self.layout, self.cfa)
-        responses = Responses.of(tables, strength, self._kernels(piece), self.cfa, self._size)
-        scale, by_colour = noise_e[channel].astype(float), noise_e[self._colours, None].astype(float)
+        responses = Responses.of(tables, strength, kernels, self.cfa, self._size)
+        scale, by_colour = noise_e[channel].astype(float), noise_e[colours, None].astype(float)
         rest = np.where(missing & ~hidden, 0.0, (tile - level_e) / scale)
         rest[~hidden] *= self.layout.taper[~hidden]
         unclipped = ~frame.clipped[piece.tile]
         found = lamp_light(rest, level_e / scale, hidden, unclipped, piece.inside, light_e / by_colour, responses)
         without_e = (found.hidden * scale[hidden] + level_e[hidden]).astype(np.float32)
         light_e = found.light * by_colour
-        halo = self._halo(piece, light_e, frame.signal_e.shape)
+        halo = self._halo(piece, light_e, kernels, frame.signal_e.shape)
         return Lamp(piece, range_e, light_e, *halo, hidden, without_e, found.evidence)
 
-    def _kernels(self, piece: Piece) -> Float32[np.ndarray, "channels ky kx"]:
-        kernel = int(self.layout.kernel[piece.index])
-        kernels: np.ndarray = interpolated_kernels(self.grid, self.layout.kernel_px[kernel : kernel + 1])[0]
-        return kernels
-
     def _halo(
-        self, piece: Piece, light_e: Float64[np.ndarray, "colours pixels"], shape: tuple[int, ...]
+        self,
+        piece: Piece,
+        light_e: Float64[np.ndarray, "colours pixels"],
+        kernels: Float32[np.ndarray, "channels ky kx"],
+        shape: tuple[int, ...],
     ) -> tuple[tuple[slice, slice], Float32[np.ndarray, "high wide"]]:
         """Return a piece's light behind its kernel, in the colour of each sample, and where it reaches."""
-        kernels = self._kernels(piece)
         down, across = (
             slice(max(part.start - size // 2, 0), min(part.stop + size // 2, most))
             for part, size, most in zip(piece.tile, kernels.shape[1:], shape, strict=True)
@@ -210,7 +206,7 @@ class LampFinder:
         sharp, halo = (np.zeros(channel.shape, dtype=np.float32) for _ in range(2))
         row, column = np.nonzero(piece.inside)
         at = row + piece.tile[0].start - down.start, column + piece.tile[1].start - across.start
-        for colour, light in zip(self._colours, light_e, strict=True):
+        for colour, light in zip(self.cfa.colours, light_e, strict=True):
             sharp[at] = light
             # A correlation, so the kernel is turned round.
             blurred = cv2.filter2D(sharp, -1, kernels[colour][::-1, ::-1], borderType=cv2.BORDER_CONSTANT)
