@@ -1,4 +1,4 @@
-"""Counts the frames of `udccal run --sink shm:NAME` in another program; docs/live.md has the layout of the memory."""
+"""`read_live.py NAME` counts the frames of `udccal run --sink shm:NAME`; docs/live.md has the layout of the memory."""
 
 import contextlib
 import fcntl
@@ -14,10 +14,10 @@ def frames(name: str) -> Iterator[tuple[int, np.ndarray | None]]:
     """Frame id and RGB picture of each newest frame, until the writer ends; None for a torn one."""
     with Path("/dev/shm", name).open("rb") as file:
         memory, seen = np.memmap(file, np.uint8, "r"), 0
+        words = memory.view(np.uint64)
         version, _, width, height, stride, kind, slots, edge = memory[8:40].view(np.uint32).tolist()
         if (bytes(memory[:8]), version, kind) != (b"UDCCALFR", 1, 1):
             sys.exit(f"expected frames of udccal, version 1, 8-bit RGB, in {name}, found something else")
-        words = memory.view(np.uint64)
         while not words[8]:  # the writer has not ended
             if (newest := int(words[7])) == seen:
                 time.sleep(1e-3)
@@ -28,14 +28,9 @@ def frames(name: str) -> Iterator[tuple[int, np.ndarray | None]]:
                 continue
             slot, seen = int(words[6]) + (newest - 1) % slots * int(words[5]), newest
             last = words[(slot + int(words[5]) - edge) // 8]  # first of all
-            rows = memory[slot + edge :][: stride * height].reshape(height, stride)
-            picture = rows[:, : 3 * width].reshape(height, width, 3).copy()
-            frame_id, first = words[slot // 8 + 1], words[slot // 8]  # last of all
-            yield int(frame_id), picture if last == newest == first else None
+            rows = memory[slot + edge :][: stride * height].reshape(height, stride)[:, : 3 * width].copy()
+            yield int(words[slot // 8 + 1]), rows.reshape(height, -1, 3) if last == newest == words[slot // 8] else None
 
 
-if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit(f"usage: {sys.argv[0]} NAME")
-    for frame_id, picture in frames(sys.argv[1]):
-        print(f"frame {frame_id}: {'torn' if picture is None else f'mean {picture.mean():.2f}'}", flush=True)
+for frame_id, picture in frames(sys.argv[1]) if __name__ == "__main__" else ():
+    print(f"frame {frame_id}: {'torn' if picture is None else f'mean {picture.mean():.2f}'}", flush=True)
