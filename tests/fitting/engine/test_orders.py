@@ -92,6 +92,15 @@ def test_what_the_data_hardly_determine_keeps_the_doubt_of_the_orders_above() ->
     )
 
 
+def test_a_part_of_the_variance_of_the_order_with_every_parameter_is_kept() -> None:
+    """The order with both parameters is so unlikely by its criterion that its weight is 0."""
+    tried = [Attempt("none", 0, 0.0, np.zeros(2)), Attempt("both", 2, 1e3, np.array([4.0, 9.0]))]
+    found = choose(tried).spread(1000, lambda own: np.zeros(2), cov=np.diag, least=0.25)
+    np.testing.assert_allclose(found, np.diag([1.0, 2.25]))
+    failed = choose([*tried, Attempt("all", 3, np.inf, np.full(2, 99.0))])
+    np.testing.assert_allclose(failed.spread(1000, lambda own: np.zeros(2), cov=np.diag, least=0.25), found)
+
+
 def test_an_order_above_that_seems_to_know_more_takes_no_variance_off() -> None:
     choice = choose([Attempt("without", 0, 0.0, 9.0), Attempt("with", 1, bic(0.0, 1.0, 1000), 1.0)])
     found = choice.spread(1000, lambda own: np.zeros(2), cov=lambda own: np.diag([own, 2.0]))

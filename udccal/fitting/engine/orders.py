@@ -64,6 +64,7 @@ class Choice(Generic[Fit]):
         values: Callable[[Fit], Float[np.ndarray, " values"]],
         against: Float[np.ndarray, " tried"] | float = 0.0,
         cov: Callable[[Fit], Float[np.ndarray, "values values"]] | None = None,
+        least: float = 0.0,
     ) -> Float[np.ndarray, "values values"]:
         """Spread of values about the chosen order's, by Akaike's weights (Buckland et al., Biometrics 53, 1997).
 
@@ -75,6 +76,8 @@ class Choice(Generic[Fit]):
             against: part of each criterion that is no cost of its parameters.
             cov: of these values in one order. A parameter that the data hardly determine may be found near 0 by chance:
                 what the orders above the chosen one do not know of it is then added.
+            least: part of what the order with the most parameters does not know that is added in any case: a mixture
+                of orders has wider tails than a normal distribution of its variance.
         """
         parameters = np.array([one.parameters for one in self.tried])
         akaike = np.array([one.criterion for one in self.tried]) - against - (np.log(max(samples, 2)) - 2) * parameters
@@ -89,6 +92,9 @@ class Choice(Generic[Fit]):
                     # The part that is a covariance: at another place an order above may know more.
                     root = square_root(cov(one.fit) - own)
                     found = found + w * root @ root.T
+            most = max(self.tried, key=lambda one: one.parameters if np.isfinite(one.criterion) else -1)
+            root = square_root(cov(most.fit) - own - found)
+            found = found + least * root @ root.T
         return found
 
 

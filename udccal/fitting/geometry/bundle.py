@@ -52,6 +52,8 @@ class GeometryRules:
             independent errors give; it is left out.
         further_order: prior odds against each further order of the distortion: a coefficient that is not needed raises
             the sigma of the others.
+        full_order: part of the variance in the order with every coefficient that a chosen order without some states at
+            least.
         prior_share: beyond this part of the information on focal length or centre, the prior chooses the order.
         most_uncertain: sigma of focal length (of itself) and centre (of the width) beyond which the views do not
             determine the lens; the model is not linear over such a sigma.
@@ -72,6 +74,7 @@ class GeometryRules:
     loud_view: float = 3.0
     copy: float = 0.25
     further_order: float = 10.0
+    full_order: float = 0.25
     prior_share: float = 0.1
     most_uncertain: float = 0.05
     worst_rms_px: float = 1.0

@@ -342,4 +342,5 @@ def _choose_order(full: _Fitted, prior: Prior) -> tuple[Choice[Solved], Float[np
         lambda of: np.append(of.place.intrinsics, of.place.poses),
         against + 2.0 * pair,
         lambda of: of.equations.joint_cov(),
+        points.rules.full_order,
     )
