@@ -27,6 +27,7 @@ from tests.benchmarks.readme_tables import put_table
 from tests.benchmarks.scenes import Scene, shared_scenes
 from udccal.arrangements import Photograph
 from udccal.cfa import cfa_named
+from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight
 from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
@@ -255,22 +256,28 @@ def main() -> int:
         print("The shared photographs (../shared/data) are absent: there is nothing to restore.", file=sys.stderr)
         return 1
     truth, profile = draw_truth(load_rig(options.rig), options.seed), load_profile(options.profile or options.rig)
-    captures, plan = truth.description.captures, PlanOptions()
+    captures = truth.description.captures
     blur = build_full_blur(truth, *BLUR_GRID, captures.psf_region_rows + 1, captures.psf_region_columns + 1)
+    found = measured(truth, blur, profile, list(shared_scenes(data, options.every)))
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "budget.json").write_text(json.dumps(found, indent=1))
+    put_table(_PAGE, f"budget {options.rig}", summary(found))
+    return 0
+
+
+def measured(truth: RigTruth, blur: FullBlur, profile: Profile, scenes: list[Scene]) -> dict[str, dict[str, float]]:
+    """What every stage costs in dB, and the PSNR of the reference, by scene."""
     restorer = Restorer.from_profile(profile, Tier.balanced)
     panel = PanelLight.of(profile.backscatter.term, profile.rig)
-    kernels, wire = kernel_grid(profile.psf.term, profile.rig, plan), profile.wire_map
+    kernels, wire = kernel_grid(profile.psf.term, profile.rig, PlanOptions()), profile.wire_map
     budget = Budget(truth, blur, restorer, panel, kernels, np.asarray(wire, dtype=np.float32))
-    bench, scenes = PictureBench(truth, blur, restorer), list(shared_scenes(data, options.every))
+    bench = PictureBench(truth, blur, restorer)
     shots = bench.shots(scenes)
     light, found = bench.matched_room_light(shots), dict[str, dict[str, float]]()
     for scene, shot in zip(scenes, shots, strict=True):
         found[shot.name] = budget.costs_dB(scene, shot, bench, light)
         print(shot.name, {name: round(value, 2) for name, value in found[shot.name].items()}, flush=True)
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "budget.json").write_text(json.dumps(found, indent=1))
-    put_table(_PAGE, f"budget {options.rig}", summary(found))
-    return 0
+    return found
 
 
 def summary(found: dict[str, dict[str, float]]) -> str:
