@@ -9,7 +9,7 @@ import numpy as np
 import scipy.ndimage
 
 from udccal.fitting.psf_stamps.data import offsets
-from udccal.fitting.psf_stamps.field import Changes, PsfField, degree_of, polynomials, see, taps
+from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, degree_of, polynomials, see, taps
 from udccal.models.fields import polynomial_basis
 
 _RNG = np.random.default_rng(8)
@@ -53,6 +53,29 @@ def test_derivatives_are_those_of_the_values() -> None:
         expected = (ends[0] - ends[1]) / (2 * step)
         # Squares of the pixel's part are left out.
         np.testing.assert_allclose(seen.jacobian[..., 4] * polynomials(_UNIT, 1)[:, 1, None], expected, atol=2e-3)
+
+
+def test_a_pedestal_is_the_same_part_of_the_light_wherever_images_are_brighter() -> None:
+    """A star's own factor takes up the images' light: a pedestal in other units would change with it over the field."""
+    nodes = np.zeros((1, 2, 40, 40))
+    nodes[0, :, 18:22, 18:22] = 1.0
+    field = PsfField(
+        nodes,
+        np.zeros((1, 2, 2, 2)),
+        np.zeros((0, 2, 2)),
+        np.array([[1.0, 0.0, 0.0], [0.2, 0.6, 0.0]]),
+        np.array([[1e-3]]),
+        0.9,
+    )
+    unit, offset = np.array([[0.0, 0.9], [0.0, -0.9]]), offsets(31, 31)
+    with jax.enable_x64(True):
+        seen = see(field, unit, np.zeros((2, 2)), offset, np.zeros((2, len(offset)), dtype=int))
+        light, edge = seen.value.sum(axis=1), seen.value[:, 0]
+        assert light.max() > 1.5 * light.min()
+        # A sum over samples is the integral to 2e-4.
+        np.testing.assert_allclose(edge / light, 1e-3 / (1 + 961e-3), rtol=1e-3)
+        _, by_own = by_maps(field, unit, 0)
+    np.testing.assert_allclose(by_own.toarray()[8::9, -1], field.light(unit)[:, 0])
 
 
 def test_a_map_stretches_light_but_not_the_pixels() -> None:

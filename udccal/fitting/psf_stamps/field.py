@@ -2,13 +2,15 @@
 
 With w the distance to the centre of the light, X the position, B_t(X) polynomials, and C_i(X) some mixtures of them,
 
-    psf(w; X) = p(X) + 1 / |M(X)|  sum_i C_i(X) P_i(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t,    C_0 = 1.
+    psf(w; X) = T(X) p(X) + 1 / |M(X)|  sum_i C_i(X) P_i(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t,
+    C_0 = 1,    T(X) = sum_i C_i(X) integral P_i.
 
 The map M stretches, shears and turns an image over the field, with few numbers. Images P_i are cubic B-splines on a
 square grid of nodes and describe the rest. L, of polynomials too, is the distance of a colour's centre from the centre
 that all colours of a stamp have in common. The pedestal p is the same all over a stamp, as far wings of a psf nearly
-are. They differ from a background only by their growth with a star's light. Over the field p changes, a polynomial of
-degree 2: neither a map that stretches images nor images that take up light from others leave far wings as they are.
+are. They differ from a background only by their growth with a star's light. That light is the images' T times a factor
+of the star's own. T changes over the field as strengths do: p is a part of it. Over the field p changes, a polynomial
+of degree 2: neither a map that stretches images nor images that take up light from others leave far wings as they are.
 
 An image contains the mean over a pixel, and the map would stretch the pixel as well. Light that is stretched before
 pixels average it differs, to second order in the pixel's size a = 1 px, by (a^2 / 24) tr((M^-1 M^-T - 1) D) of the
@@ -48,7 +50,7 @@ class PsfField(eqx.Module):
         lateral: polynomials of lateral colour, in px (x, y), without the constant, which the images contain; of all
             planes except the reference, from which it is measured.
         mix: the polynomials' coefficients in the strength C of each image.
-        pedestal: polynomials of the light per pixel that all samples of a stamp have in common.
+        pedestal: polynomials of the part of the images' light that each pixel of a stamp has in common with all others.
         spacing_px: between nodes.
     """
 
@@ -91,9 +93,13 @@ class PsfField(eqx.Module):
         every = np.insert(np.asarray(self.lateral), self.reference, 0.0, axis=0)
         return np.einsum("sm,pmi->spi", polynomials(unit, degree_of(1 + every.shape[1]))[:, 1:], every)
 
+    def light(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars planes"]:
+        """Return T at positions scaled to about [-1, 1]."""
+        return self.strengths(unit) @ np.asarray(self.nodes).sum(axis=(2, 3)).T * self.spacing_px**2
+
     def pedestals(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars planes"]:
-        """Return p at positions scaled to about [-1, 1]."""
-        return polynomials(unit, degree_of(self.pedestal.shape[1])) @ np.transpose(self.pedestal)
+        """Return T p at positions scaled to about [-1, 1]."""
+        return self.light(unit) * (polynomials(unit, degree_of(self.pedestal.shape[1])) @ np.transpose(self.pedestal))
 
     def moved(self, changes: Changes) -> PsfField:
         """Return the field after the first of these changes."""
@@ -208,7 +214,8 @@ def by_maps(
         basis = polynomials(unit, degree_of(1 + field.lateral.shape[1]))[:, 1:]
         parts.append(scipy.sparse.kron(basis, one[:, 1:3]))
     index.append(pedestal.reshape(field.pedestal.shape)[plane])
-    basis = polynomials(unit, degree_of(field.pedestal.shape[1]))
+    # The images' light hardly changes with a step: a pedestal is a small part of it.
+    basis = field.light(unit)[:, [plane]] * polynomials(unit, degree_of(field.pedestal.shape[1]))
     parts.append(scipy.sparse.kron(basis, one[:, [PEDESTAL]]))
     return np.concatenate(index), scipy.sparse.csr_array(scipy.sparse.hstack(parts, format="csr"))
 
