@@ -120,6 +120,26 @@ def test_a_device_shows_what_the_cpu_shows(
         assert agree(off(restorers[tier], devices[tier], frame, shown), 2 if tier is Tier.accurate else 1)
 
 
+@pytest.mark.medium
+def test_halos_of_lamps_are_taken_off_on_a_device_too(
+    toy_rig: RigDescription, toy_noise: Noise, toy_grid: KernelGrid
+) -> None:
+    rows, columns = 160, 128
+    rig = toy_rig.model_copy(update={"camera": toy_rig.camera.model_copy(update={"rows": rows, "columns": columns})})
+    restorer = made(Tier.accurate, rig, toy_noise, nominal_geometry(rig), toy_grid)
+    y, x = np.mgrid[:rows, :columns]
+    scene = np.repeat(2e3 * (1 + 0.8 * np.sin(x / 7 + y / 9))[..., None], 3, axis=2)
+    scene[116:124, 60:68] = 6e5
+    frame = exposed(restorer, toy_grid, scene)
+    device = DeviceRestorer.of(restorer, jax.devices("cpu")[0])
+    assert agree(off(restorer, device, frame, None), 2)
+    assert restorer.sharpener is not None
+    halos = replace(restorer, sharpener=replace(restorer.sharpener, options=replace(restorer.options, lamps=0)))
+    assert not agree(off(halos, device, frame, None), 2)
+    # Of a frame without a lamp, nothing is taken to the device.
+    assert device._lamps(np.minimum(frame, 2000), EXPOSURE_S, None) is device.no_lamps
+
+
 def test_of_an_unknown_panel_something_is_put_back(restorers: dict[Tier, Restorer], frame: np.ndarray) -> None:
     """So that the comparison of devices sees it."""
     restorer = restorers[Tier.fast]

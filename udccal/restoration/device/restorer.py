@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8, UInt16
+from jaxtyping import Array, Bool, Float, UInt8, UInt16
 
 from udccal.arguments import check_kind
 from udccal.errors import RestorationError
@@ -22,7 +22,8 @@ from udccal.restoration.device.light import FrontEnd, PanelTables, plausible
 from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
 from udccal.restoration.device.tile_filter import TileFilter
 from udccal.restoration.kernel_grid import interpolated_kernels
-from udccal.restoration.linear import least_saturated_DN, variance_floor_e2
+from udccal.restoration.lamp_pieces import lamp_pieces
+from udccal.restoration.linear import least_saturated_DN, saturated, variance_floor_e2
 from udccal.restoration.network import SHARPER, Weights, network_weights
 from udccal.restoration.rectify import interpolation_taps
 from udccal.restoration.runtime import Restorer
@@ -32,6 +33,19 @@ from udccal.restoration.tone import CODES, TONE_ADVICE, Tone
 from udccal.tiers import Tier
 
 PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
+
+
+class _Lamps(eqx.Module):
+    """What ``WithoutLamps`` has, on a device.
+
+    Attributes:
+        change: of the signal in e-, where halos are taken off. others: clipped samples that are no lamps.
+        white: the lamps, as bright as the range.
+    """
+
+    change: Mosaic
+    others: Bool[Array, "rows columns"]
+    white: Mosaic
 
 
 class _Stages(eqx.Module):
@@ -53,13 +67,23 @@ class _Stages(eqx.Module):
 
     @jax.jit
     def shown(
-        self, raw: UInt16[Array, "rows columns"], scale: Array, exposed: Array, known: Array, rate: Mosaic
+        self,
+        raw: UInt16[Array, "rows columns"],
+        scale: Array,
+        exposed: Array,
+        known: Array,
+        rate: Mosaic,
+        lamps: _Lamps | None,
     ) -> tuple[UInt8[Array, "view_rows view_columns 3"], Float[Array, "3"]]:
         """Return what a display shows of some rows, and the arguments of ``refuse_excess_of``."""
         with jax.default_matmul_precision("highest"):
             signal, variance, clipped, panel, levels, excess = self.front.light(raw, exposed, known, rate)
             inner = self.tiles.layout.inner
+            if lamps is not None:
+                signal, clipped = signal + lamps.change, clipped & lamps.others
             sharp = self._sharp(signal, variance, clipped)
+            if lamps is not None:
+                sharp = jnp.where(lamps.white[inner] > 0, jnp.maximum(sharp, lamps.white[inner]), sharp)
             of_unknown = sharp, levels, inner.start, exposed
             sharp = jax.lax.cond(known, lambda: sharp, lambda: self.front.put_back(*of_unknown))
             if self.error > 0:
@@ -97,14 +121,15 @@ class _Stages(eqx.Module):
 class DeviceRestorer:
     """A restorer whose tables lie on a device.
 
-    It shows what ``Restorer.display`` shows, but for rounding, and for halos of lamps, which stay at every tier. The
-    first frame takes the seconds of a compilation. Three things are done another way. Every strength of a tile's prior
-    is tried, not only those beside the best of some. A tile where clipped samples are completed has no picture of its
-    own before that. Whether a scene has dark places is decided by all of its rows.
+    It shows what ``Restorer.display`` shows, but for rounding. The first frame takes the seconds of a compilation.
+    Lamps beyond the range are fitted by the processor, as long as that takes. Three things are done another way. Every
+    strength of a tile's prior is tried, not only those beside the best of some. A tile where clipped samples are
+    completed has no picture of its own before that. Whether a scene has dark places is decided by all of its rows.
 
     Attributes:
         restorer: as prepared. stages: what frames pass. panel: sums over the panel's pixels.
         latest: picture of the panel. rate: its backscatter in e-/s.
+        no_lamps: of a frame without any; None for a tier that leaves their halos.
     """
 
     restorer: Restorer
@@ -112,6 +137,7 @@ class DeviceRestorer:
     panel: PanelTables | None
     latest: PanelPicture
     rate: Mosaic
+    no_lamps: _Lamps | None
 
     @classmethod
     def of(cls, restorer: Restorer, device: jax.Device | None = None) -> DeviceRestorer:
@@ -141,15 +167,18 @@ class DeviceRestorer:
         white, error = (None, 0.0) if restorer.mask is None else (restorer.mask.white, restorer.mask.error)
         pixel, index = restorer.rectification.from_row(layout.first_row).fixed
         before, taps = interpolation_taps(options.interpolation)
-        front, filters, bands, learned, maps, panel, dark = jax.device_put(
+        dark = np.zeros((layout.reach.stop - layout.reach.start, camera.columns), np.float32)
+        accurate = restorer.tier is Tier.accurate
+        front, filters, bands, learned, maps, panel, dark, lamps = jax.device_put(
             (
                 (restorer.blind.wire, white, restorer.noise, least_saturated_DN(restorer.noise)),
                 (tables.matched, tables.vectors, tables.values),
                 None if noise is None else (noise.variance, noise.probe),
-                (network_weights(), kernels) if restorer.tier is Tier.accurate else None,
+                (network_weights(), kernels) if accurate else None,
                 (pixel.astype(np.int32) - before, np.stack([index % len(taps), index // len(taps)], axis=-1), taps),
                 None if restorer.panel is None else vars(restorer.panel.sums),
-                np.zeros((layout.reach.stop - layout.reach.start, camera.columns), np.float32),
+                dark,
+                (dark, dark == 0, dark) if accurate else None,
             ),
             device or jax.devices()[0],
         )
@@ -160,7 +189,7 @@ class DeviceRestorer:
             if panel is None
             else PanelTables(**{name: part for name, part in panel.items() if name != "region"}, cfa=cfa)
         )
-        return cls(restorer, stages, sums, np.empty((0, 0, 3), np.uint8), dark)
+        return cls(restorer, stages, sums, np.empty((0, 0, 3), np.uint8), dark, lamps and _Lamps(*lamps))
 
     def display(
         self,
@@ -184,8 +213,29 @@ class DeviceRestorer:
         exposed = np.array([exposure_s, dark_DN(noise, exposure_s), variance_floor_e2(noise, exposure_s)], np.float32)
         scale = tone.of_electrons(exposure_s).scale()
         rows = self.restorer.blind.mended(mosaic[self.restorer.rows], exposure_s)
-        given = rows, scale, exposed, np.bool_(known)
-        shown, excess = jax.device_get(self.stages.shown(*jax.device_put(given, self.rate.device), self.rate))
+        given = jax.device_put((rows, scale, exposed, np.bool_(known)), self.rate.device)
+        lamps = self._lamps(mosaic, exposure_s, panel_picture)
+        shown, excess = jax.device_get(self.stages.shown(*given, self.rate, lamps))
         if known:
             refuse_excess_of(*map(float, excess))
         return np.asarray(shown)
+
+    def _lamps(
+        self,
+        mosaic: UInt16[np.ndarray, "frame_rows frame_columns"],
+        exposure_s: float,
+        panel_picture: PanelPicture | None,
+    ) -> _Lamps | None:
+        """Return the lamps of a frame, fitted by the processor where any piece that clips may be one."""
+        restorer, sharpener = self.restorer, self.restorer.sharpener
+        if self.no_lamps is None or sharpener is None:
+            return None
+        clipped, rows = saturated(mosaic[restorer.rows], restorer.noise), sharpener.grid.kernels.shape[-2]
+        if not lamp_pieces(clipped, sharpener.layout, sharpener.options.lamps, rows):
+            return self.no_lamps
+        light = restorer.scene_light(mosaic, exposure_s, panel_picture)
+        dark = sharpener.without_lamps(light.signal_e, light.variance_e2, light.clipped)
+        if dark.white_e is None:
+            return self.no_lamps
+        change = dark.signal_e - light.signal_e
+        return _Lamps(*jax.device_put((change, dark.clipped, dark.white_e), self.rate.device))
