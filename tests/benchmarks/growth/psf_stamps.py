@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tests.benchmarks.growth.cases import Case
-from tests.fitting.psf_stamps.test_psf_stamps import make
+from tests.scenes.two_gaussians import make
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 
 # Pixels along a stamp's side, by its pixels.

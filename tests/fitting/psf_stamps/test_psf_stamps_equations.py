@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fitting.psf_stamps.test_psf_stamps import make
+from tests.scenes.two_gaussians import make
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.equations import (
     Band,

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.fitting.psf_stamps.test_psf_stamps import SENSOR
 from tests.scenes.stamps import drawn
+from tests.scenes.two_gaussians import SENSOR
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.result import FitResult

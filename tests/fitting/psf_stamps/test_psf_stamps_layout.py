@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.fitting.psf_stamps.test_psf_stamps import READ_E, SENSOR
+from tests.scenes.two_gaussians import READ_E, SENSOR
 from udccal.errors import FitError
 from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.fitting.psf_stamps.test_psf_stamps import READ_E, make
 from tests.scenes.stamps import drawn as whole
+from tests.scenes.two_gaussians import READ_E, make
 from udccal.fitting.psf_stamps.data import StampsRules
 from udccal.fitting.psf_stamps.field import Changes
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps

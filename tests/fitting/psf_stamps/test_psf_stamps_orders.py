@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.fitting.psf_stamps.test_psf_stamps import READ_E, SENSOR, places
 from tests.scenes.stamps import drawn
+from tests.scenes.two_gaussians import READ_E, SENSOR, places
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.psf_stamps.search import Found, Orders, coarse, improve, with_more_images

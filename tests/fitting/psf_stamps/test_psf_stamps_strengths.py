@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.fitting.psf_stamps.test_psf_stamps import make
 from tests.scenes.stamps import drawn
+from tests.scenes.two_gaussians import make
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.field import polynomials
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps

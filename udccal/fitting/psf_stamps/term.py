@@ -220,6 +220,8 @@ class StampsPsf:
         seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
         index, matrix = by_maps(field, unit, plane)
         own, used, change = matrix @ changes.maps[index], np.arange(len(grid)), np.empty((*seen.value.shape, k))
+        size = np.random.default_rng(4).standard_normal(k) / np.sqrt(max(k, 1))
+        own.reshape(len(unit), OWN, k)[:, 3:7] += self._beyond_stars(unit, plane).reshape(-1, 4, 1) * size
         # One star at a time: changes of its image along all draws may take 10 MB.
         for star in range(len(unit)):
             one = slice(star, star + 1)
@@ -227,3 +229,14 @@ class StampsPsf:
             of_star = own[star * OWN : (star + 1) * OWN]
             change[star] = changes_of_light(Seen(*(part[one] for part in seen)), of_star, images, used)
         return seen.value, change, seen.jacobian[..., 1:3]
+
+    def _beyond_stars(self, unit: Float[np.ndarray, "n 2"], plane: int) -> Float[np.ndarray, "n 2 2"]:
+        """Return the part of the map by which it stretches more, or less, than at any star.
+
+        It is one more standard deviation: where there are no stars around, polynomials may do anything.
+        """
+        stars = (self.star_px - self.centre_px) / self.half_px
+        maps, known = (self.field.maps(place)[:, plane] for place in (unit, stars))
+        areas, like = np.abs(np.linalg.det(maps)), np.abs(np.linalg.det(known))
+        stretch = 1 - np.sqrt(np.clip(areas, like.min(), like.max()) / areas)
+        return maps * stretch[:, None, None]
