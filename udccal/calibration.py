@@ -50,7 +50,7 @@ class Foundation:
     boards: tuple[BoardView, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Calibration(TermResults):
     """The five results of one session and their durations.
 

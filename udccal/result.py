@@ -165,9 +165,9 @@ class TermPosterior(Protocol[_Term_co]):
         """Draw ``count`` terms from the posterior."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FitResult(Generic[Term]):
-    """A fitted term and the evidence for it.
+    """A fitted term and the evidence for it. As it holds arrays, it is equal to itself alone.
 
     Attributes:
         name: noise, geometry, wire, psf or backscatter.

@@ -34,7 +34,7 @@ class Compared:
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ProfileDiff:
     """Two profiles of one rig compared. docs/diff.md describes each number; ``diff.json`` holds these fields.
 

@@ -28,7 +28,7 @@ INVALIDATED_BY = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Profile(TermResults):
     """One rig as measured.
 

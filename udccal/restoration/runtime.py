@@ -73,7 +73,7 @@ class SceneLight:
     levels: Float32[np.ndarray, "3"] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Restorer:
     """A profile prepared to restore frames at one tier.
 

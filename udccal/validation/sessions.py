@@ -21,7 +21,7 @@ FORMAT, VERSION = "udccal-session-comparison", 1
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SessionComparison:
     """Whether two sessions show the same rig. docs/validate.md describes each number.
 

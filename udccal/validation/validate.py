@@ -32,7 +32,7 @@ _AT_ONCE = 2
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Validation:
     """Whether a profile predicts a session. docs/validate.md describes each number.
 

@@ -117,7 +117,7 @@ class _Stages(eqx.Module):
 
 
 @final
-@dataclass
+@dataclass(eq=False)
 class DeviceRestorer:
     """A restorer whose tables lie on a device.
 
