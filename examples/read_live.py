@@ -13,8 +13,7 @@ import numpy as np
 def frames(name: str) -> Iterator[tuple[int, np.ndarray | None]]:
     """Frame id and RGB picture of each newest frame, until the writer ends; None for a torn one."""
     with Path("/dev/shm", name).open("rb") as file:
-        memory, seen = np.memmap(file, np.uint8, "r"), 0
-        words = memory.view(np.uint64)
+        words, seen = (memory := np.memmap(file, np.uint8, "r")).view(np.uint64), 0
         version, _, width, height, stride, kind, slots, edge = memory[8:40].view(np.uint32).tolist()
         if (bytes(memory[:8]), version, kind) != (b"UDCCALFR", 1, 1):
             sys.exit(f"expected frames of udccal, version 1, 8-bit RGB, in {name}, found something else")
@@ -32,5 +31,6 @@ def frames(name: str) -> Iterator[tuple[int, np.ndarray | None]]:
             yield int(words[slot // 8 + 1]), rows.reshape(height, -1, 3) if last == newest == words[slot // 8] else None
 
 
-for frame_id, picture in frames(sys.argv[1]) if __name__ == "__main__" else ():
-    print(f"frame {frame_id}: {'torn' if picture is None else f'mean {picture.mean():.2f}'}", flush=True)
+if __name__ == "__main__":
+    for frame_id, picture in frames(sys.argv[1]):
+        print(f"frame {frame_id}: {'torn' if picture is None else f'mean {picture.mean():.2f}'}", flush=True)

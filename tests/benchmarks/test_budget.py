@@ -8,17 +8,12 @@ import pytest
 from tests.benchmarks import budget
 from tests.benchmarks.full_blur import build_full_blur
 from tests.benchmarks.scenes import Scene
-from tests.scenes.toy_restorer import NOISE
+from tests.scenes.toy_restorer import NOISE, fitted
 from tests.simulation.toy import toy_truth
 from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
-from udccal.result import FitResult, FitStatus
 from udccal.simulation.wire import wire_map
-
-
-def _fitted(term: object) -> FitResult:
-    return FitResult("test", term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 100)
 
 
 @pytest.mark.medium
@@ -32,11 +27,11 @@ def test_what_a_profile_lacks_costs_in_its_own_row(monkeypatch: pytest.MonkeyPat
     profile = build_profile(
         rig,
         provenance_now(None, None),
-        noise=_fitted(NOISE),
-        geometry=_fitted(geometry),
-        wire=_fitted(absent_wire(rig, geometry)),
-        psf=_fitted(absent_psf(rig, geometry)),
-        backscatter=_fitted(absent_backscatter(rig, geometry)),
+        noise=fitted(NOISE),
+        geometry=fitted(geometry),
+        wire=fitted(absent_wire(rig, geometry)),
+        psf=fitted(absent_psf(rig, geometry)),
+        backscatter=fitted(absent_backscatter(rig, geometry)),
         wire_map=wire_map(truth).astype(np.float32),
     )
     cost = budget.measured(truth, blur, profile, [scene])["patches"]

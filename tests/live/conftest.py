@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.scenes.toy_restorer import fitted
 from udccal.cameras.protocol import Frame, Region, Settings
 from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.fitting.wire.fit import sensor_map
@@ -15,7 +17,7 @@ from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import write_profile
-from udccal.result import FitResult, FitStatus
+from udccal.result import FitStatus
 from udccal.rig import RigDescription, load_rig
 
 ROWS, COLUMNS = 36, 64
@@ -35,13 +37,11 @@ def profile_of(rig: RigDescription, noise: Noise = NOISE) -> Profile:
     geometry = nominal_geometry(rig)
     wire = absent_wire(rig, geometry)
 
-    def found(term: object, status: FitStatus = FitStatus.ABSENT) -> FitResult:
-        return FitResult("test", term, status, (), np.zeros((0, 0)), 1.0, 100)
-
+    found = partial(fitted, status=FitStatus.ABSENT)
     return build_profile(
         rig,
         provenance_now(None, None),
-        noise=found(noise, FitStatus.CONVERGED),
+        noise=fitted(noise),
         geometry=found(geometry),
         wire=found(wire),
         psf=found(absent_psf(rig, geometry)),

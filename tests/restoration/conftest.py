@@ -13,7 +13,6 @@ from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 
 
@@ -58,11 +57,7 @@ def profile(small_rig: RigDescription, toy_noise: Noise) -> Profile:
     residual = np.pad(np.asarray(point.residual), ((0, 0), (0, 0), (7, 7), (7, 7)))
     dark = absent_backscatter(small_rig, geometry)
     lit = type(dark)(**{**vars(dark), "mask": np.full(np.shape(dark.mask), 2.0e4), "window": 24})
-
-    def fitted(term: object) -> FitResult:
-        return FitResult("test", term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 100)
-
-    wire = absent_wire(small_rig, geometry)
+    wire, fitted = absent_wire(small_rig, geometry), toy_restorer.fitted
     return build_profile(
         small_rig,
         provenance_now(None, None),

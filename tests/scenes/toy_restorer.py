@@ -17,6 +17,7 @@ from udccal.restoration.rectify import Rectification
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.sharpen import Sharpener
 from udccal.restoration.view import inscribed_view
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.tiers import Tier
 
@@ -71,6 +72,11 @@ def scene() -> np.ndarray:
         row, column = rng.integers(5, 60, 2)
         picture[row : row + 25, column : column + 30] *= rng.uniform(0.3, 1.4, 3)
     return (6000.0 * picture).astype(np.float32)
+
+
+def fitted(term: object, status: FitStatus = FitStatus.CONVERGED) -> FitResult:
+    """A result that states nothing but its term."""
+    return FitResult("test", term, status, (), np.zeros((0, 0)), 1.0, 100)
 
 
 def made(

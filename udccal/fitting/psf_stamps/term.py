@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, final
 
 import numpy as np
@@ -158,7 +159,7 @@ class StampsPsf:
         """Yield kernels at positions that somebody asks for."""
         check_positions(position_px, "n", "Give (x, y) in px for each kernel.", FitError)
         check_count(plane, "a plane", 0, len(self.field.nodes) - 1, FitError)
-        self._check_like_stars(np.asarray(position_px, dtype=np.float64))
+        self._check_like_stars(position_px)
         return self._kernels(position_px, plane)
 
     def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
@@ -166,7 +167,7 @@ class StampsPsf:
         grid = offsets(self.rows, self.columns)
         window = grid * np.exp(-0.5 * (grid**2).sum(axis=1) / self.window_px**2)[:, None]
         for start in range(0, len(position_px), 8):
-            unit = (np.asarray(position_px[start : start + 8], dtype=np.float64) - self.centre_px) / self.half_px
+            unit = self._unit(position_px[start : start + 8])
             centre = self._centres(unit, window)
             reference = _, own, by_centre = self._light(unit, centre, self.field.reference)
             centre_change = -np.linalg.solve(window.T @ by_centre, window.T @ own)
@@ -178,16 +179,22 @@ class StampsPsf:
             shape = change / total[:, None, None] - value[..., None] * relative[:, None]
             yield Kernels(value, centre, total, shape, centre_change, relative, jacobian)
 
+    def _unit(self, position_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        return (np.asarray(position_px, dtype=np.float64) - self.centre_px) / self.half_px
+
+    @cached_property
+    def _star_areas(self) -> Float[np.ndarray, "stars planes"]:
+        """By how much the map makes images of each plane larger at the stars."""
+        return np.asarray(np.linalg.det(self.field.maps(self._unit(self.star_px))))
+
     def _check_like_stars(self, position_px: Float[np.ndarray, "n 2"]) -> None:
         """Refuse positions at which the map stretches far more or less than at any star: its polynomials run away."""
-        areas = [
-            np.linalg.det(self.field.maps((place - self.centre_px) / self.half_px)[:, self.field.reference])
-            for place in (position_px, self.star_px)
-        ]
-        least, most = areas[1].min(), areas[1].max()
+        reference = self.field.reference
+        areas = np.linalg.det(self.field.maps(self._unit(position_px))[:, reference])
+        least, most = self._star_areas[:, reference].min(), self._star_areas[:, reference].max()
         # A poor fit may turn the map over at a star.
         low, high = min(least / _MOST_STRETCH, least), max(most * _MOST_STRETCH, most)
-        off = ~((areas[0] >= low) & (areas[0] <= high))
+        off = ~((areas >= low) & (areas <= high))
         if off.any():
             (left, top), (right, bottom) = self.centre_px - self.half_px, self.centre_px + self.half_px
             x, y = position_px[off][0]
@@ -235,8 +242,7 @@ class StampsPsf:
 
         It is one more standard deviation: where there are no stars around, polynomials may do anything.
         """
-        stars = (self.star_px - self.centre_px) / self.half_px
-        maps, known = (self.field.maps(place)[:, plane] for place in (unit, stars))
-        areas, like = np.abs(np.linalg.det(maps)), np.abs(np.linalg.det(known))
+        maps, like = self.field.maps(unit)[:, plane], np.abs(self._star_areas[:, plane])
+        areas = np.abs(np.linalg.det(maps))
         stretch = 1 - np.sqrt(np.clip(areas, like.min(), like.max()) / areas)
         return maps * stretch[:, None, None]
