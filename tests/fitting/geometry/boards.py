@@ -9,9 +9,11 @@ from typing import Any
 import cv2
 import jax
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from udccal.arrangements import BoardSpec
 from udccal.board.charuco import board_points_mm, charuco_board
+from udccal.fitting.geometry.bundle import Intrinsics, projected
 from udccal.fitting.geometry.calibrated import CalibratedViews
 from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.data import BoardView, gather
@@ -99,6 +101,15 @@ class Sight:
             xy = exact[seen] + self.sigma_px[k, seen, None] * rng.standard_normal((len(seen), 2))
             corners = BoardCorners(seen, xy, own[k, seen])
             found.append(BoardView(f"geometry/view_{k}", self.spec, k < parallel, corners, 0.0))
+        return found
+
+    def pictures(self, board: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+        """Corners of a board whose points are elsewhere than described, with noise; NaN where they are not seen."""
+        found, truth = [], Intrinsics.of_geometry(self.camera).vector
+        for pose, inside, sigma in zip(self.poses, self.seen(), self.sigma_px, strict=True):
+            there = Rotation.from_rotvec(pose[:3]).apply(board) + pose[3:]
+            noise = sigma[:, None] * rng.standard_normal((len(board), 2))
+            found.append(np.where(inside[:, None], projected(truth, there)[0] + noise, np.nan))
         return found
 
 

@@ -81,11 +81,7 @@ def test_a_board_of_another_shape_is_fitted_and_named(bow_mm: float, stretch: fl
     flat = board_points_mm(SCENE.spec)
     u = (2 * flat[:, 0] - flat[:, 0].min() - flat[:, 0].max()) / np.ptp(flat[:, 0])
     bent = flat * np.array([stretch, 1.0, 1.0]) + np.outer(bow_mm * (1 - u**2), [0.0, 0.0, 1.0])
-    truth, rng, pictures = Intrinsics.of_geometry(SCENE.camera).vector, np.random.default_rng(3), []
-    for pose, seen, sigma in zip(SCENE.poses, SCENE.seen(), SCENE.sigma_px, strict=True):
-        there = Rotation.from_rotvec(pose[:3]).apply(bent) + pose[3:]
-        noise = sigma[:, None] * rng.standard_normal((len(flat), 2))
-        pictures.append(np.where(seen[:, None], projected(truth, there)[0] + noise, np.nan))
+    truth, pictures = Intrinsics.of_geometry(SCENE.camera).vector, SCENE.pictures(bent, np.random.default_rng(3))
     found = calibrated([flat] * len(pictures), pictures, SCENE.size)
     assert any(told in note for note in found.notes), found.notes
     assert not found.disagreement.found

@@ -70,13 +70,6 @@ def board_shape(solved: Solved, points: Points, free: Free, prior: Prior, dof: f
     """
     if len(points.names) <= points.rules.least_views:
         return None
-    try:
-        return _explaining(solved, points, free, prior, dof)
-    except np.linalg.LinAlgError:  # corners that fit no board may lead to derivatives that are no numbers
-        return None
-
-
-def _explaining(solved: Solved, points: Points, free: Free, prior: Prior, dof: float) -> BoardShape | None:
     values, cov, test = _step(solved, points, free, dof)
     if not test.found:
         return None

@@ -21,7 +21,8 @@ from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.misfit import chi2_test
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import Cauchy, outliers, robust_sigma
-from udccal.fitting.geometry.board_shape import board_shape
+from udccal.fitting.geometry.board_points import BoardPoints, board_points
+from udccal.fitting.geometry.board_shape import BoardShape, board_shape
 from udccal.fitting.geometry.bundle import (
     EVERY,
     NOTHING_KNOWN,
@@ -80,16 +81,14 @@ def calibrate_views(
         given, least, lambda points: _Search(points, known).best_of(starts(points, image_size, start, start_poses))
     )
     given = replace(given, used=robust.points.used)
-    likely = _scaled(robust, given, EVERY, known)
-    if shape := board_shape(likely.solved, likely.points, EVERY, known, likely.dof):
-        likely = _scaled(likely, replace(given, board=shape.points.board), EVERY, known)
+    likely, boards = _of_the_board(_scaled(robust, given, EVERY, known), given, known)
     orders, between = _choose_order(likely, known)
     free = ORDERS[orders.best.name]
     final = _scaled(replace(likely, solved=orders.best.fit), likely.points, free, known)
     points, solved, bundle = final.points, final.solved, final.solved.place.facing()
     disagree, cov = disagreement(solved, points, free, final.dof)
-    if shape:
-        cov = cov + shape.added_cov(solved, points, free)
+    for board in boards:
+        cov = cov + board.added_cov(solved, points, free)
     pattern, pattern_px = residual_pattern(solved, points, image_size, final.dof)
     places = (f"view {points.names[points.view[k]]}, point {points.index[k]}" for k in np.flatnonzero(~points.used))
     views = CalibratedViews(
@@ -105,7 +104,7 @@ def calibrate_views(
         pattern=pattern,
         pattern_px=pattern_px,
         status=FitStatus.CONVERGED if solved.converged else FitStatus.NOT_CONVERGED,
-        notes=(*gathered.notes, *(shape.told() if shape else ())),
+        notes=(*gathered.notes, *(sentence for board in boards for sentence in board.told())),
         outliers=(*gathered.outliers, *strange, *rules.corners.listed(places)),
         iterations=likely.solved.iterations,
         image_size=image_size,
@@ -202,6 +201,21 @@ class _Search:
         scales = np.maximum(np.maximum(own, 0.5 * robust_sigma(seen)), _least_scale(self.given))
         off = rules.corners.off(z / scales[view, None]).any(axis=1)
         return scales, ~off | (np.bincount(view[~off], minlength=views) < rules.least_corners)[view]
+
+
+def _of_the_board(likely: _Fitted, given: Points, prior: Prior) -> tuple[_Fitted, list[BoardShape | BoardPoints]]:
+    """The minimum with the board as the views show it, and how that differs from its description."""
+    found = list[BoardShape | BoardPoints]()
+    for differs in (board_shape, board_points):
+        try:
+            board = differs(likely.solved, likely.points, EVERY, prior, likely.dof)
+        except np.linalg.LinAlgError:  # corners that fit no board may lead to derivatives that are no numbers
+            break
+        if board is not None:
+            found.append(board)
+            given = replace(given, board=board.points.board)
+            likely = _scaled(likely, given, EVERY, prior)
+    return likely, found
 
 
 def check_picture(image_size: object, points: Points) -> None:
