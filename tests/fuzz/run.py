@@ -12,6 +12,7 @@ A target whose inputs take long gets one in so many of the inputs (``Target.one_
 from __future__ import annotations
 
 import argparse
+import itertools
 import subprocess
 import sys
 import tempfile
@@ -19,6 +20,7 @@ import time
 from pathlib import Path
 
 import atheris
+import jax
 
 # Atheris never frees what a comparison of arrays gives. Modules that compare whole pictures read no bytes.
 _OF_PICTURES = ["udccal.restoration.tone", "udccal.fitting.noise.codes", "udccal.fitting.noise.moments"]
@@ -26,7 +28,7 @@ _OF_PICTURES = ["udccal.restoration.tone", "udccal.fitting.noise.codes", "udccal
 with atheris.instrument_imports(include=["udccal"], exclude=_OF_PICTURES):
     from tests.fuzz.targets import TARGETS
 
-_MEMORY_MIB = 2048
+_MEMORY_MIB, _KEPT_COMPILED = 2048, 500
 KEPT = Path(__file__).with_name("kept")
 
 
@@ -59,7 +61,15 @@ def _run_here(name: str, inputs: int) -> None:
             "-seed=1",
             "-print_final_stats=1",
         ]
-        atheris.Setup([sys.argv[0], *options, folder], target.try_out)
+        number = itertools.count(1)
+
+        def tried(data: bytes) -> None:
+            target.try_out(data)
+            # Targets that take long compile for every size that an input changes, and JAX keeps all of that.
+            if target.one_in > 1 and next(number) % _KEPT_COMPILED == 0:
+                jax.clear_caches()
+
+        atheris.Setup([sys.argv[0], *options, folder], tried)
         atheris.Fuzz()
 
 

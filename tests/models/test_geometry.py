@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from udccal.compilation import compilation_clock
 from udccal.models import geometry as g
 from udccal.numerics import in_float64
 
@@ -114,3 +117,14 @@ def test_without_distortion_the_virtual_view_is_a_homography() -> None:
         matrix = np.asarray(g.virtual_rotation_homography(plain, view))
     back = np.concatenate([sensor, np.ones((3, 1))], axis=1) @ matrix.T
     np.testing.assert_allclose(back[:, :2] / back[:, 2:], points, atol=1e-7)
+
+
+def test_rays_of_another_lens_compile_nothing_anew() -> None:
+    """A program that asks for rays again and again would wait for a compilation each time, and fill its memory."""
+    clock = compilation_clock()
+    with jax.enable_x64(True):
+        g.unproject(GEOMETRY, pixels())
+        before = clock.seconds
+        other = replace(GEOMETRY, distortion=GEOMETRY.distortion + 1e-4)
+        np.asarray(g.unproject(other, pixels()))
+    assert clock.seconds == before

@@ -5,6 +5,8 @@ docs/conventions.md defines pixel coordinates, frames and signs. All functions a
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -116,6 +118,8 @@ def project(geometry: Geometry, points: Float[Arrayish, "*n 3"]) -> Float[Array,
     return distort(geometry, ideal) * jnp.asarray(geometry.focal_px) + jnp.asarray(geometry.principal_point_px)
 
 
+# Compiled once per shape. A loop outside of compiled code is compiled at every call, and its memory is never freed.
+@partial(jax.jit, static_argnames="iterations", inline=True)
 def unproject(geometry: Geometry, pixels: Float[Arrayish, "*n 2"], iterations: int = 12) -> Float[Array, "*n 2"]:
     """Undo distortion and intrinsics by fixed-point iteration.
 
