@@ -116,8 +116,8 @@ def _from_mean(problem: DiffractionProblem, rules: PsfRules) -> Approach:
 
 
 def _descended(problem: DiffractionProblem, theta: Theta, own: Own, rules: PsfRules) -> Approach:
-    """Go from a place until a step gains a thousandth of the cost."""
-    end = minimise(problem, problem.at(theta, own), solver_rules(1e-3 * problem.used, rules.iterations))
+    """Go from a place until a step gains a thousandth of the samples' number."""
+    end = minimise(problem, problem.at(theta, own), _first_rules(1e-3 * problem.used, rules.iterations))
     return Approach(problem, end)
 
 
@@ -134,11 +134,11 @@ def _with_bar(problem: DiffractionProblem, without: Approach, own: Own, rules: P
     for axis, part in product(range(2), rules.bar_places):
         prior = shaped_prior(problem.prior, rules, (axis, part * float(problem.prior.mean[OPENINGS][axis])))
         barred = replace(few, prior=prior)
-        end = minimise(barred, barred.at(prior.mean, own[spread]), solver_rules(enough, rules.bar_steps))
+        end = minimise(barred, barred.at(prior.mean, own[spread]), _first_rules(enough, rules.bar_steps))
         begun.append(Approach(barred, end))
         LOG.debug("psf: a bar from %.2f of openings of %s, cost %.6g", part, AXES[axis], end.equations.cost)
     begun.sort(key=lambda one: one.end.equations.cost - one.end.gain)
-    rest = solver_rules(enough, rules.iterations)
+    rest = _first_rules(enough, rules.iterations)
     ends = [replace(one, end=minimise(one.problem, one.end.place, rest)) for one in begun[: rules.bar_ends]]
     best = min(ends, key=lambda one: one.end.equations.cost)
     costs = [position.cost for position in without.problem.by_position(without.end.place)]
@@ -170,3 +170,11 @@ def solver_rules(enough: float, iterations: int, most_damping: float = 1e6) -> S
     """Return the rules of a descent that ends where a step would gain less than ``enough``."""
     # Derivatives are sums over a lattice, whose errors predict a small gain without end.
     return SolverRules(enough, stalled_gain=0.05, iterations=iterations, first_damping=1e-2, most_damping=most_damping)
+
+
+def _first_rules(enough: float, iterations: int) -> SolverRules:
+    """Return the same for a first descent, which also ends where a step has gained less than ``enough``.
+
+    Where the model does not fit, the derivatives promise a hundred times what steps gain, for as long as they go on.
+    """
+    return replace(solver_rules(enough, iterations), stalled_gain=enough, small_gain=math.inf)

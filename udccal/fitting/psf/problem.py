@@ -95,25 +95,37 @@ class DiffractionProblem:
         """Number of parameters, those of each shot included."""
         return self.prior.mean.size + OWN * int((self.samples.index >= 0).sum())
 
-    def at(self, theta: Theta, own: Own, near: Place | None = None) -> Place:
-        """Return the place of these parameters, with the derivatives of a place ``near`` it, or with its own."""
+    def at(self, theta: Theta, own: Own, near: Place | None = None, far: bool = False) -> Place:
+        """Return the place of these parameters, with its own derivatives, or with those of a place ``near`` it.
 
-        def lit(part: tuple[Samples, Own]) -> tuple[np.ndarray, ...]:
+        Derivatives take most of the time. Where that place is ``far``, they are made if the cost is lower than there:
+        a step that is not taken needs none.
+        """
+        parts = list(zip(self.samples.each(), own, strict=True))
+
+        def lit(part: tuple[Samples, Own]) -> tuple[Kernel, Light, Light]:
             one, own = part
             kernel = kernel_of(self.evaluator, theta, one)
-            here = one.unit_light(kernel, own[:, :2])
             # A shot's own place and the overlaps change the light to first order.
             changed = one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
-            light = (here + changed) * one.flux(own)
-            if near is not None:
-                return (light,)
-            return light, _slopes(self.evaluator, theta, one, own), one.own_slopes(own, kernel, here, changed)
+            return kernel, one.unit_light(kernel, own[:, :2]), changed
 
-        made = in_two_threads(lit, zip(self.samples.each(), own, strict=True))
-        light, *derivatives = (np.stack(one) for one in zip(*made, strict=True))
+        def sloped(part: tuple[tuple[Samples, Own], tuple[Kernel, Light, Light]]) -> tuple[np.ndarray, np.ndarray]:
+            (one, own), (kernel, here, changed) = part
+            return _slopes(self.evaluator, theta, one, own), one.own_slopes(own, kernel, here, changed)
+
+        found = in_two_threads(lit, parts)
+        light = np.stack([(here + by) * one.flux(at) for (one, at), (_, here, by) in zip(parts, found, strict=True)])
         if near is not None:
-            derivatives = [_by_grown(near.by_theta, theta[_SHAPES] - near.theta[_SHAPES]), near.by_own]
-        return Place(theta, own, light, *derivatives)
+            by_theta = _by_grown(near.by_theta, theta[_SHAPES] - near.theta[_SHAPES])
+            place = Place(theta, own, light, by_theta, near.by_own)
+            if not far or self._cost(place) >= self._cost(near):
+                return place
+        derivatives = in_two_threads(sloped, zip(parts, found, strict=True))
+        return Place(theta, own, light, *(np.stack(one) for one in zip(*derivatives, strict=True)))
+
+    def _cost(self, place: Place) -> float:
+        return float(HUBER.loss(self.errors(place)).sum()) + self.prior.cost(place.theta)
 
     def by_position(self, place: Place) -> list[Blocks]:
         """Return each position's part of the Gauss-Newton equations with Huber's weights, without the prior."""
@@ -142,7 +154,7 @@ class DiffractionProblem:
         """Return the place after a step."""
         theta, own = stepped(place.theta, step.shared), _moved_own(place.own, step.own.reshape(place.own.shape))
         # The gain is the square of the step's length in sigmas: derivatives hardly change over five of them.
-        return self.at(theta, own, place if step.gain < 25.0 else None)
+        return self.at(theta, own, place, far=step.gain >= 25.0)
 
     def with_dropped_begun_again(self, place: Place, model_error: float) -> Place:
         """Return the place with own parameters of pictures without weight as their samples alone have them.
