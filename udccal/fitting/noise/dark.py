@@ -237,7 +237,8 @@ def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float) -> tuple[Q
         for i, pair in enumerate(data.darks):
             p = pair_probability(pair, values, K_DN_per_e, codes.row_DN, 0.0)
             by_row = row_gain(pair, values, K_DN_per_e, codes.row_DN) * codes.row_DN
-            expected[i] = float(np.sum(p * pair.differences_DN**2)) / (2 * float(p.sum())) - by_row**2
+            if (inside := float(p.sum())) > 0:  # It is 0 where pixels that fill keep a mean off the line.
+                expected[i] = float(np.sum(p * pair.differences_DN**2)) / (2 * inside) - by_row**2
     # Tails that are heavier than the family's heaviest.
     heavy = codes.white and values[4] <= LOW[4] + 1e-3
     most_hits = 0.0 if heavy else data.rules.most_hits

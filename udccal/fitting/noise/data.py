@@ -46,6 +46,8 @@ class NoiseRules:
             none of the family's distributions.
         most_hits: fraction of pixels that radiation hits at most in a dark pair.
         contradictory: chance below which the noise of dark frames contradicts their exposure times.
+        apart: factor by which dark signals may differ from their exposures' ratio: a sensor that warms by 10 degrees.
+        stuck: part of the other dark pairs' temporal variance below which a pair is stuck at a code.
         most_hot: fraction of dark samples that are hot pixels above which a note tells of them.
         most_shared: change of the gain by noise that neighbours share above which the fit is poor.
         worst_chi2: reduced chi-squared above which the sensor is not what the model says.
@@ -66,6 +68,8 @@ class NoiseRules:
     foreign_sigma: float = 3.0
     most_hits: float = 1e-4
     contradictory: float = 1e-9
+    apart: float = 3.0
+    stuck: float = 0.02
     most_hot: float = 1e-3
     most_shared: float = 0.05
     worst_chi2: float = 6.0

@@ -14,11 +14,12 @@ from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.noise.codes import Five, start_values
+from udccal.fitting.noise.contradictions import contradiction
 from udccal.fitting.noise.dark import fit_dark_terms, unlike_exposures
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, fit_curve, shared_by_neighbours
 from udccal.fitting.noise.frame_moments import bins, stacked
-from udccal.fitting.noise.moments import NoiseMoments, contradiction, reduced, rough_gain
+from udccal.fitting.noise.moments import NoiseMoments, reduced, rough_gain
 from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import DarkTerms, Pattern, prnu, rough_median
 from udccal.fitting.noise.saturation import find_saturation
@@ -112,10 +113,11 @@ def _too_little(data: NoiseMoments, start: Five) -> tuple[FitStatus, str] | None
     brightest = max(float(np.median(flat.mean_DN)) for flat in data.flats) - float(start[0])
     if brightest < 0.05 * float(np.sqrt(start[2])):
         return FitStatus.TOO_DARK, f"The brightest flat lies {brightest:.3g} DN above black."
+    if wrong := contradiction(data):
+        return FitStatus.POOR_FIT, wrong
     if any(pair.edges_DN[-1] == np.inf and pair.counts[-1].sum() > 0.5 * pair.counts.sum() for pair in data.darks):
         return FitStatus.SATURATED, "Dark frames lie at the converter's largest code. Lower the black level."
-    wrong = contradiction(data)
-    return (FitStatus.POOR_FIT, wrong) if wrong else None
+    return None
 
 
 def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[FitStatus, str] | None:
