@@ -15,6 +15,7 @@ import pytest
 import typer
 from typer.main import get_command
 
+from udccal.cameras.protocol import CameraIdentity
 from udccal.cli.app import app
 from udccal.cli.bench_options import BenchOptions, CameraKind, DisplayKind
 from udccal.cli.jobs.plan import plan_captures
@@ -24,6 +25,8 @@ from udccal.cli.output import Output
 from udccal.cli.run import run
 from udccal.errors import UdccalError
 from udccal.io.png import write_rgb8
+from udccal.rig import load_rig
+from udccal.sessions.writer import SessionWriter
 
 PORTRAIT = str(Path(__file__).resolve().parents[2] / "udccal" / "data" / "portrait.jpg")
 
@@ -111,6 +114,26 @@ def test_a_session_within_the_profile_is_refused(tmp_path: Path) -> None:
     places = ["--session", str(tmp_path / "p" / "s"), "--profile", str(tmp_path / "p")]
     assert udccal("calibrate", "--rig", "lg55-reduced", *places).returncode == 2
     assert not any(tmp_path.iterdir())
+
+
+def test_profiles_are_not_written_into_a_session(tmp_path: Path) -> None:
+    session, within = str(tmp_path / "s"), str(tmp_path / "s" / "p")
+    new = str(tmp_path / "new")
+    SessionWriter.create(tmp_path / "s", load_rig("lg55-reduced"), CameraIdentity("a", "b", "c", "d")).close()
+    before = sorted(tmp_path.rglob("*"))
+    for words, said in (
+        (["fit", session, "--profile", within], "inside the session"),
+        (["calibrate", "--rig", "lg55-reduced", "--session", session, "--profile", within], "inside the session"),
+        (["calibrate", "--rig", "lg55-reduced", "--session", new, "--profile", f"{new}/p"], f"apart from {new}"),
+        (["profile", "pack", "no-profile", f"{within}.zip"], "inside the session"),
+        (["profile", "export", "no-profile", "--to", "csv", "--out", within], "inside the session"),
+        (["profile", "import", "no-file", "--from", "mrcal", "--rig", "lg55-reduced", "--out", within], "the session"),
+    ):
+        done = udccal(*words)
+        assert done.returncode == 1
+        (sentence,) = done.stderr.strip().splitlines()  # no stage has run
+        assert said in sentence
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 SIMULATED = BenchOptions(CameraKind.sim, None, None, DisplayKind.manual, 0, 0)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import udccal
+from udccal.profiles.schema import VERSION
 from udccal.result import FitStatus
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -88,6 +89,12 @@ def test_the_python_page_has_every_public_name() -> None:
     assert {name for _, name in paths} >= set(udccal.__all__)
     for module, name in paths:
         assert getattr(importlib.import_module(module), name).__doc__, f"{module}.{name}"
+
+
+def test_the_page_of_the_profile_is_of_its_present_version() -> None:
+    page = (ROOT / "docs" / "profile.md").read_text(encoding="utf-8")
+    assert re.findall(r"Format version (\d+)|`version`: (\d+)", page) == [(str(VERSION), ""), ("", str(VERSION))]
+    assert re.findall(r"^Version (\d+)", page, re.MULTILINE)[0] == str(VERSION)
 
 
 def test_the_tables_of_tiers_are_of_one_run() -> None:

@@ -87,15 +87,14 @@ def calibrate(
 
     description = load_rig(rig)
     # What is wrong with the words or the rig is told before the seconds that loading all else takes.
+    from udccal.cli.jobs.apart import check_profile_place
     from udccal.cli.jobs.capture import Wanted
     from udccal.cli.jobs.fit import fit_to_profile
     from udccal.cli.jobs.log_file import check_log
     from udccal.io.out_folder import check_writable
-    from udccal.profiles.store import check_replaceable
     from udccal.sessions.changes import Exchanged
 
-    check_replaceable(profile)
-    check_writable(profile.parent)
+    check_profile_place(profile, session)
     check_log(log, session, profile)
     if log is not None:
         check_writable(log.parent)

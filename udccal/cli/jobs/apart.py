@@ -6,7 +6,8 @@ import os
 from pathlib import Path
 
 from udccal.errors import SessionError, UdccalError
-from udccal.profiles.store import check_outside_profiles
+from udccal.io.out_folder import check_writable
+from udccal.profiles.store import check_outside_profiles, check_replaceable
 from udccal.sessions.manifest import MANIFEST_NAME, PREVIOUS_NAME
 
 
@@ -36,6 +37,22 @@ def check_apart(file: Path, *given: Path | None) -> None:
                 f"Expected a place apart from {each}, which this command needs for something else, found {file}. "
                 "Choose another path."
             )
+
+
+def check_profile_place(path: Path, *given: Path | None) -> None:
+    """Refuse a path at which a profile cannot be written, or that is among others' files; call it before the work.
+
+    Args:
+        path: of the profile.
+        given: as for ``check_apart``.
+
+    Raises:
+        ProfileError: as ``check_replaceable``.
+        SessionError, UdccalError: as ``check_apart``; also when the folder cannot be written to.
+    """
+    check_replaceable(path)
+    check_apart(path, *given)
+    check_writable(path.parent)
 
 
 def check_folder_apart(folder: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Final
 
 from udccal.benches.bench import CaptureBench
 from udccal.cli.bench_options import BenchOptions
+from udccal.cli.jobs.apart import check_profile_place
 from udccal.cli.jobs.capture import Wanted
 from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output, plain
@@ -23,7 +24,7 @@ from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.planned_steps import planned_ids
 from udccal.profiles.profile import Profile
-from udccal.profiles.store import check_outside_profiles, check_replaceable, load_profile, write_profile
+from udccal.profiles.store import check_outside_profiles, load_profile, write_profile
 from udccal.reports.check_page import changes_table, check_page
 from udccal.reports.page import write_page
 from udccal.rig import RigDescription
@@ -64,8 +65,7 @@ def check_profile(
     check_writable(out)
     if update is not None:
         _check_apart(update, out)
-        check_replaceable(update)
-        check_writable(update.parent)
+        check_profile_place(update)
     profile = load_profile(path)
     check_measured(profile)
     rig, folder = short_rig(profile.rig), out / "session"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
+from udccal.cli.jobs.apart import check_apart
 from udccal.cli.output import Output
 from udccal.io.out_folder import storing_in
 from udccal.profiles.copies import migrate_profile, pack_profile, unpack_profile
@@ -56,6 +57,7 @@ def migrate(output: Output, source: Path, target: Path) -> None:
 
 def _write(output: Output, source: Path, target: Path, write: Callable[[Path, Path], object]) -> None:
     found = find_profile(source)
+    check_apart(target)
     with storing_in(target.parent):
         write(found, target)
         now = identity(target)

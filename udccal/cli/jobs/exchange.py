@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
+from udccal.cli.jobs.apart import check_apart, check_profile_place
 from udccal.cli.output import Output
 from udccal.comparison.place import place_of
 from udccal.io.out_folder import storing_in
 from udccal.profiles.exchange.exports import EXPORTS, covariance_file, export_profile
 from udccal.profiles.exchange.imports import IMPORTS, profile_of, read_lens
-from udccal.profiles.store import check_replaceable, load_profile, write_profile
+from udccal.profiles.store import load_profile, write_profile
 from udccal.result import FitStatus
 from udccal.rig import load_rig
 
@@ -55,6 +56,7 @@ def export(output: Output, path: Path, to: str, out: Path) -> None:
         ProfileError: when the profile cannot be read, or the file exists.
         UdccalError: when the file cannot be written.
     """
+    check_apart(out)
     profile, into = load_profile(path), EXPORTS[to]
     place = place_of(profile)
     with storing_in(out.parent):
@@ -87,7 +89,7 @@ def import_(output: Output, of: str, file: Path, rig: str, out: Path) -> None:
         ProfileError: when the file cannot be read, does not fit the rig, or something else is at ``out``.
         UdccalError: when the profile cannot be written.
     """
-    check_replaceable(out)
+    check_profile_place(out)
     description = load_rig(rig)
     profile = profile_of(read_lens(file, IMPORTS[of]), description, f"{file.name} ({of})")
     with storing_in(out.parent):

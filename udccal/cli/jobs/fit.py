@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import final
 
 from udccal.calibration import ORDER, Calibration, Foundation, calibrate
+from udccal.cli.jobs.apart import check_profile_place
 from udccal.cli.jobs.log_file import check_log, log_file
 from udccal.cli.output import Output, StageTime
 from udccal.compilation import compilation_clock, keep_compilations
@@ -18,10 +19,10 @@ from udccal.effort import FitEffort
 from udccal.errors import FitError
 from udccal.fitting.engine.least_squares import LOG
 from udccal.io.links import refuse_links
-from udccal.io.out_folder import check_writable, storing_in
+from udccal.io.out_folder import storing_in
 from udccal.profiles.history import identity
 from udccal.profiles.profile import Profile
-from udccal.profiles.store import check_replaceable, read_profile
+from udccal.profiles.store import read_profile
 from udccal.refit import refit
 from udccal.reports.page import write_page
 from udccal.reports.report import calibration_page, gather
@@ -73,11 +74,10 @@ def fit_to_profile(
         SessionError: when the session is missing or damaged.
         FitError: when a term has no error bars; then the report is written and the profile is not.
         ProfileError: when something else is at the profile's path, or a profile whose terms cannot be kept.
-        UdccalError: when the profile's folder cannot be written to, or ``log`` is in a profile or a session; this is
-            found before any work.
+        UdccalError: when the profile's folder cannot be written to, or it or ``log`` is in a profile or a session; this
+            is found before any work.
     """
-    check_replaceable(profile_path)
-    check_writable(profile_path.parent)
+    check_profile_place(profile_path, session_path)
     check_log(log, session_path, profile_path)
     before = read_profile(profile_path) if terms else None
     parent = identity(profile_path).sha256 if terms else None
