@@ -22,7 +22,8 @@ class ToySensor:
 
     ``other_noise`` draws read noise of unit variance in place of Tukey's lambda; a fraction ``telegraph`` of the pixels
     has three times the read noise. ``pattern`` is a relative response in addition to the white one, ``dark_pattern``
-    the pixels' dark current over their mean.
+    the pixels' dark current over their mean. ``response`` maps a
+    linear signal to one that is seen, both over the full well, and takes the place of ``bend``.
     """
 
     rows: int = 96
@@ -41,6 +42,7 @@ class ToySensor:
     DSNU_e: float = 3.0
     PRNU: float = 0.008
     bend: float = 0.02
+    response: Callable[[np.ndarray], np.ndarray] | None = None
     bits: int = 12
     flux_e_per_s: float = 50_000.0
     flicker: float = 0.0
@@ -90,7 +92,10 @@ def expose(
     dark = sensor.dark_e_per_s * (1.0 if sensor.dark_pattern is None else sensor.dark_pattern)
     mean = exposure_s * (np.maximum(light * fixed.response, 0.0) + dark)
     counts = rng.poisson(mean).astype(np.float64)
-    bent = np.minimum(counts * (1 - sensor.bend * counts / sensor.full_well_e), sensor.full_well_e)
+    bent = counts * (1 - sensor.bend * counts / sensor.full_well_e)
+    if sensor.response is not None:
+        bent = sensor.full_well_e * sensor.response(counts / sensor.full_well_e)
+    bent = np.minimum(bent, sensor.full_well_e)
     draw = sensor.other_noise
     noise = draw(rng, shape) if draw else _read_noise(sensor.lambda_read, shape, rng)
     signal = bent + fixed.offset_e + fixed.read_e * noise

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 
 from udccal.cfa import cfa_named
-from udccal.fitting.noise.transfer import temporal_variance
+from udccal.fitting.noise.response import temporal_variance
 from udccal.models.noise import Noise, linear_signal
 from udccal.result import FitResult
 from udccal.sessions.store import Average

@@ -14,7 +14,7 @@ import numpy as np
 from udccal.arrangements import Dark, FlatLight
 from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.noise.data import NoiseRules
-from udccal.fitting.noise.transfer import temporal_variance
+from udccal.fitting.noise.response import temporal_variance
 from udccal.planning.design import Limits
 from udccal.planning.state import EvenField, RigState, sensor_samples
 from udccal.rig import Captures

@@ -16,7 +16,7 @@ from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.noise.data import NoiseData, NoiseRules, read_noise
 from udccal.fitting.noise.frame_moments import Moments, stacked
 from udccal.fitting.noise.moments import NoiseMoments, reduced
-from udccal.fitting.noise.transfer import temporal_variance
+from udccal.fitting.noise.response import temporal_variance
 from udccal.models.noise import Noise, linear_signal
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult

@@ -14,8 +14,8 @@ from udccal.errors import ProfileError
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, read_wire, sample_pixels, weighed
 from udccal.fitting.wire.fit import unusable_flat
 from udccal.fitting.wire.jacobian import values_at
-from udccal.fitting.wire.map_error import misfit
 from udccal.fitting.wire.parameters import WireRules
+from udccal.fitting.wire.residuals import misfit
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile

@@ -19,7 +19,7 @@ from tests.scenes.noise import ToySensor, expose, measure, patterns, truth
 from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.noise.codes import DarkPair, dark_pair, excess_kurtosis, pair_probability
 from udccal.fitting.noise.data import NoiseRules
-from udccal.fitting.noise.transfer import temporal_variance
+from udccal.fitting.noise.response import temporal_variance
 
 # Every sensor has so many realisations: its bound takes longer than they do.
 _SENSORS, _REALISATIONS = 50, 20

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.scenes.noise import PLAIN, capture, captured, measure
-from udccal.fitting.noise.data import ExposureLevel, NoiseData
+from udccal.fitting.noise.data import Averaged, ExposureLevel, NoiseData, SpatialStack
 from udccal.fitting.noise.fit import fit_noise
 from udccal.models.noise import Noise
 from udccal.result import FitResult, FitStatus
@@ -43,6 +43,48 @@ def test_the_longest_dark_pair_that_is_lit_is_named() -> None:
     result = fit_noise(NoiseData(levels, top_code=4095))
     assert result.status is FitStatus.POOR_FIT
     assert f"or leave the dark ones of {exposure(8)} out" in result.notes[0]
+
+
+@pytest.mark.parametrize("kind", ["dark", "bright"])
+@pytest.mark.parametrize("rows", [slice(0, 2), slice(40, 96)])
+def test_a_torn_frame_is_named(kind: str, rows: slice) -> None:
+    """Half of a dark frame that was the one before left sigma_d 91 sigma off, in silence."""
+    first, second = (frame.copy() for frame in getattr(capture(PLAIN, 3)[0][4], kind))
+    second[rows] = first[rows]
+    result = with_level(4, **{kind: (first, second)})
+    assert result.status is FitStatus.POOR_FIT
+    assert f"found {rows.stop - rows.start} of 96 rows of one frame in the other: they are torn" in result.notes[0]
+
+
+def averaged(claimed: int, frames: int = 8) -> FitResult[Noise]:
+    """The fit with averages of ``frames`` frames that are said to be of ``claimed``."""
+    levels, stack = capture(replace(PLAIN, DSNU_e=0.0, PRNU=0.0, stack_frames=frames), 3)
+    means = [
+        np.mean(np.array(each), axis=0, dtype=np.float64).astype(np.float32) for each in (stack.dark, stack.bright)
+    ]
+    dark, bright = (Averaged(stack.exposure_s, mean, claimed) for mean in means)
+    return fit_noise(NoiseData(levels, SpatialStack(stack.exposure_s, dark, bright), top_code=4095))
+
+
+@pytest.mark.parametrize("claimed", [1, 3])
+def test_an_average_of_more_frames_than_it_says_is_named(claimed: int) -> None:
+    result = averaged(claimed)
+    assert result.status is FitStatus.POOR_FIT
+    assert f"as those of {claimed} frames do" in result.notes[0]
+
+
+def test_an_average_of_a_sensor_without_patterns_is_fitted() -> None:
+    assert averaged(8).ok
+
+
+@pytest.mark.parametrize("value", [0, 64, 4095])
+def test_rows_of_one_code_and_noise_below_a_code_are_not_torn(value: int) -> None:
+    levels, stack = capture(replace(PLAIN, read_e=0.3, row_DN=0.0, K_DN_per_e=0.3), 3)
+    dark = tuple(frame.copy() for frame in levels[4].dark)
+    for frame in dark:
+        frame[10] = value
+    levels[4] = replace(levels[4], dark=dark)
+    assert not any("torn" in note for note in fit_noise(NoiseData(levels, stack, top_code=4095)).notes)
 
 
 @pytest.mark.parametrize("offset_DN", [-6, 6])

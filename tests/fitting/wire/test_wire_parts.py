@@ -16,7 +16,6 @@ from udccal.fitting.engine.least_squares import SolverRules, minimise
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, sample_pixels, weighed
 from udccal.fitting.wire.fit import select
 from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, expected_of, wire_derivatives
-from udccal.fitting.wire.map_error import Misfits, misfit, misfits
 from udccal.fitting.wire.parameters import (
     Kind,
     WireRules,
@@ -28,6 +27,7 @@ from udccal.fitting.wire.parameters import (
     shape_vector,
     with_shape,
 )
+from udccal.fitting.wire.residuals import Misfits, misfit, misfits
 from udccal.fitting.wire.search import Descent, Search, scan_rows
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, log_baseline, modulation, slopes
@@ -262,6 +262,32 @@ def test_lines_of_the_sensor_that_differ_are_part_of_the_model_error(rows: float
     assert found.lines.sigma == pytest.approx(np.hypot(rows, columns), rel=0.25)
     assert found.sigma >= found.lines.sigma
     assert found.excess == 0
+
+
+def test_a_spot_of_few_pixels_is_found_at_its_place_and_size() -> None:
+    """A sum over the sensor's tiles did not show it: an edge, a ring and a blob of 0.3 to 0.5 % went unsaid."""
+    structure = np.zeros((ROWS, COLUMNS))
+    structure[75:95, 110:140] = -1e-2
+    found = misfits_with(structure)
+    assert found.spots.test.found
+    assert not found.lines.test.found
+    assert (COLUMNS * found.spot.across, ROWS * found.spot.down) == pytest.approx((125, 85), abs=16)
+    assert found.spot.off == pytest.approx(-1e-2, rel=0.4)
+    assert found.sigma == pytest.approx(1e-2 * np.sqrt(600 / structure.size), rel=0.6)
+
+
+def test_the_edge_of_a_shadow_is_found_though_no_part_stands_out() -> None:
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    edge = 4e-3 * np.sign(x + y - 130) * np.exp(-np.abs(x + y - 130) / 15)
+    found = misfits_with(edge)
+    assert found.spots.test.found
+    assert found.spots.sigma == pytest.approx(float(np.std(edge)), rel=0.4)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_shows_no_spots(seed: int) -> None:
+    # White, and less than the noise that is expected: no part of it is a spot.
+    assert not misfits_with(1e-3 * np.random.default_rng(seed).standard_normal((ROWS, COLUMNS))).spots.test.found
 
 
 def test_noise_shows_no_lines() -> None:

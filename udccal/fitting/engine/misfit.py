@@ -79,6 +79,12 @@ def f_test(statistic: float, rank: int, dof: float) -> MisfitTest:
     return MisfitTest(float(ratio), f_tail(ratio, rank, rest))
 
 
+def largest_test(z: Float[np.ndarray, " n"]) -> MisfitTest:
+    """Test the largest of n independent unit normals, by its absolute value (Bonferroni's correction)."""
+    largest = float(np.abs(z).max())
+    return MisfitTest(largest, min(1.0, z.size * chi2_tail(largest**2, 1.0)))
+
+
 def sharper(*tests: MisfitTest) -> MisfitTest:
     """The test of the lowest p-value, which is multiplied by the number of tests (Bonferroni's correction)."""
     best = min(tests, key=lambda t: t.p_value)

@@ -17,7 +17,7 @@ _SORT = "Sort the stack's frames, or leave the stack out."
 
 def contradiction(data: NoiseMoments) -> str | None:
     """A sentence on frames that cannot be what they are given as; None where nothing is wrong."""
-    tests = _copies, _stuck_pair, _unlike_pair, _dark_stack, _flat_stack
+    tests = _copies, _stuck_pair, _unlike_pair, _dark_stack, _flat_stack, _averages
     return next((wrong for test in tests for wrong in test(data)), None)
 
 
@@ -30,6 +30,11 @@ def _copies(data: NoiseMoments) -> Iterator[str]:
     if twice := [of.exposure_s for of in data.dark_moments if of.repeated]:
         found = f"copies of one frame at {len(twice)} exposures (the first of {twice[0]:.4g} s)"
         yield f"Expected noise between the two frames of dark pairs, found {found}. Give two frames that were taken."
+    for name, pairs in (("dark", data.dark_moments), ("bright", data.flats)):
+        if torn := [of for of in pairs if of.torn]:
+            expected = f"Expected noise between all rows of two {name} frames of {torn[0].exposure_s:.4g} s"
+            found = f"found {torn[0].torn} of {torn[0].height} rows of one frame in the other: they are torn"
+            yield f"{expected}, {found}. Take that pair again, or leave it out."
 
 
 def _stuck_pair(data: NoiseMoments) -> Iterator[str]:
@@ -131,6 +136,24 @@ def _flat_stack(data: NoiseMoments) -> Iterator[str]:
         risen = float(noise[below]) + rough_gain(data, black, quiet) * max(mean - float(signals[below]), 0.0)
         low, high = min(float(noise[below]), next_up), max(risen, next_up)
         yield from _unlike("flat", own, 0.7 * low, 1.4 * high, data.rounding_DN2)
+
+
+def _averages(data: NoiseMoments) -> Iterator[str]:
+    """Pixels of an average made elsewhere differ by their temporal noise over its number of frames, or by more."""
+    for name, stack, seen, pairs in (
+        ("dark", data.dark_stack, data.dark_seen, data.dark_moments),
+        ("flat", data.flat_stack, data.flat_seen, data.flats),
+    ):
+        if seen is not None:
+            continue
+        levels, noise = np.array(sorted((of.level_DN, of.temporal_DN2) for of in pairs)).T
+        least = max(float(np.interp(stack.mean_DN.mean(), levels, noise)) - data.rounding_DN2, 0.0) / stack.frames
+        beside = stack.mean_DN[:, data.period :] - stack.mean_DN[:, : -data.period]
+        # Rounding, and the mean of two frames without their common noise, leave less.
+        if float(np.var(beside)) / 2 < data.rules.quiet * least - data.rounding_DN2 / stack.frames:
+            expected = f"Expected pixels of the {name} average to differ by {least**0.5:.3g} DN at least, as those of"
+            found = f"{stack.frames} frames do, found {(np.var(beside) / 2) ** 0.5:.3g} DN"
+            yield f"{expected} {found}: it may be the mean of more frames, or smoothed. Give the number that it has."
 
 
 def _unlike(name: str, variance_DN2: float, low_DN2: float, high_DN2: float, rounding_DN2: float) -> Iterator[str]:

@@ -48,6 +48,7 @@ class NoiseRules:
         contradictory: chance below which the noise of dark frames contradicts their exposure times.
         apart: factor by which dark signals may differ from their exposures' ratio: a sensor that warms by 10 degrees.
         stuck: part of the other dark pairs' temporal variance below which a pair is stuck at a code.
+        quiet: part of the noise that its number of frames leaves below which an average has more frames.
         most_hot: fraction of dark samples that are hot pixels above which a note tells of them.
         most_shared: change of the gain by noise that neighbours share above which the fit is poor.
         worst_chi2: reduced chi-squared above which the sensor is not what the model says.
@@ -70,6 +71,7 @@ class NoiseRules:
     contradictory: float = 1e-9
     apart: float = 3.0
     stuck: float = 0.02
+    quiet: float = 0.5
     most_hot: float = 1e-3
     most_shared: float = 0.05
     worst_chi2: float = 6.0

@@ -22,9 +22,9 @@ from udccal.fitting.noise.frame_moments import bins, stacked
 from udccal.fitting.noise.moments import NoiseMoments, reduced, rough_gain
 from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import DarkTerms, Pattern, prnu, rough_median
+from udccal.fitting.noise.response import linear_mean, temporal_variance
 from udccal.fitting.noise.saturation import find_saturation
-from udccal.fitting.noise.transfer import temporal_variance
-from udccal.models.noise import Noise, linear_signal
+from udccal.models.noise import Noise
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus
 from udccal.rig import RigDescription
@@ -158,7 +158,7 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[FitStat
 
 def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> Pattern:
     """PRNU from the stacks; the photon transfer curve gives the temporal variance of the averages."""
-    K, V0, c, *_, gain_noise2 = curve.values.tolist()
+    K, V0, c, *_, gain_noise2, d = curve.values.tolist()
     bright, stack, rate = data.flat_stack, data.dark_stack, dark.dark_DN_per_s.value
     quiet = max(V0, 0.0) + data.rounding_DN2
     at_no_light = (quiet + K * rate * bright.exposure_s) / bright.frames
@@ -170,9 +170,9 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> Patter
         signal = bright.mean_DN.astype(np.float32) - np.float32(dark.black_DN + rate * bright.exposure_s)
         at_no_light += dark.dsnu_DN2.value
     level = max(rough_median(signal), 1e-6)
-    z = float(linear_signal(np.array(level), c, K))
-    steep = 1 - 2 * c * z
-    shot = temporal_variance(z, K, 0.0, c, 0.0, gain_noise2) / level / bright.frames
+    z = float(linear_mean(*(np.array([[value]]) for value in (level, c, d, K)))[0, 0])
+    steep = 1 - (2 * c + 3 * d * z) * z
+    shot = temporal_variance(z, K, 0.0, c, 0.0, gain_noise2, d) / level / bright.frames
     found = prnu(signal, at_no_light, shot, data.period, data.rules.defect_sigma)
     # Where the response bends, a relative change of light is a smaller relative change of signal.
     scale = (level / (z * steep)) ** 2
@@ -188,12 +188,11 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     PRNU2 = Quantity.asked("PRNU", uneven.variance, uneven.sigma**2, uneven.samples)
     values, cov = _values(data, dark, curve, saturation, PRNU2)
     full_DN = max(curve.ceiling_DN - dark.black_DN, 1.0)
-    bent_too_far = abs(float(fit.values[2])) * full_DN >= 0.999 * rules.most_bent
     # Gain noise beyond shot noise is no sensor's: the lamp's pattern changes.
     unsteady = bool(fit.values[5] * full_DN > fit.values[0])
     shared = shared_by_neighbours(data, curve)
     linked = shared.found and abs(shared.gain_factor - 1) > rules.most_shared
-    poor = fit.misfit.ratio > rules.worst_chi2 or bent_too_far or linked or unsteady
+    poor = fit.misfit.ratio > rules.worst_chi2 or fit.at_bound or linked or unsteady
     converged = dark.fit.converged or dark.foreign
     status = FitStatus.CONVERGED if fit.converged and converged else FitStatus.NOT_CONVERGED
     shown = len(NAMES) - (not fit.order.curved)
@@ -219,6 +218,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
             Diagnostic("photon_transfer_up_to", curve.fit_up_to, "1"),
             Diagnostic("saturated_bins", float(curve.full.sum()), "1"),
             Diagnostic("curvature", float(fit.values[2]), "1/DN"),
+            Diagnostic("curvature_growth", float(fit.values[6]), "1/DN^2"),
             Diagnostic("response_DN_per_light", float(fit.values[3]), "DN"),
             Diagnostic("light_offset", float(fit.values[4]), "light"),
             Diagnostic("light_scatter", fit.scatter, "1"),
@@ -227,7 +227,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
             Diagnostic("dark_samples_outside_histogram", float(outside), "1"),
             Diagnostic("edge_gain", float(np.sqrt(np.mean(dark.fit.edge_gains**2))), "1"),
         ),
-        notes=tuple(notes(data, dark, curve, uneven, shared, values, bent_too_far)),
+        notes=tuple(notes(data, dark, curve, uneven, shared, values)),
         outliers=tuple(one for one in left_out(data, dark, curve, uneven, float(values[2])) if one.count),
         residuals=residual_sample(places[np.nonzero(used)[1]], fit.variance_z[used]),
         posterior=Posterior.from_cov(values[:shown], cov[:shown, :shown], _term),
@@ -242,23 +242,24 @@ def _values(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation: tuple[float, float], PRNU2: Quantity
 ) -> tuple[Float[np.ndarray, "11"], Float[np.ndarray, "11 11"]]:
     """The estimates, and their covariance from that of the fitted quantities."""
-    K, V0, c = curve.values[:3].tolist()
-    transfer = curve.cov[:3, :3]
+    K, V0, c, *_, d = curve.values.tolist()
+    picked = [0, 1, 2, 6]
+    transfer = curve.cov[np.ix_(picked, picked)]
     total = Quantity(V0 + dark.row_DN2.value, float(transfer[1, 1]) + dark.row_DN2.variance)
     roots = [one.root() for one in (total, dark.row_DN2, dark.dsnu_DN2, PRNU2)]
     (sigma_d, by_total), (row, by_row), (spread, by_spread), (response, by_response) = roots
     (level, level_sigma), rate = saturation, dark.dark_DN_per_s.value
     full_DN = level - dark.black_DN
     values = np.array([K, dark.black_DN, level, sigma_d / K, dark.shape.value, row, data.q_DN, rate / K, spread / K,
-                       response, c * full_DN])  # fmt: skip
-    # Inner quantities: K, V0, c, sigma_row^2, black, rate, saturation, shape, DSNU^2, PRNU^2.
-    inner = np.diag([0.0] * 6 + [level_sigma**2, dark.shape.variance, dark.dsnu_DN2.variance, PRNU2.variance])
-    inner[:3, :3], inner[3, 3], inner[4:6, 4:6] = transfer, dark.row_DN2.variance, dark.levels_cov
-    jacobian = np.zeros((11, 10))
-    jacobian[[0, 1, 2, 4], [0, 4, 6, 7]] = 1.0
-    jacobian[3, [0, 1, 3]] = -sigma_d / K**2, by_total / K, by_total / K
-    jacobian[5, 3], jacobian[9, 9] = by_row, by_response
-    jacobian[7, [0, 5]] = -rate / K**2, 1 / K
-    jacobian[8, [0, 8]] = -spread / K**2, by_spread / K
-    jacobian[10, [2, 4, 6]] = full_DN, -c, c
+                       response, (c + d * full_DN) * full_DN])  # fmt: skip
+    # Inner quantities: K, V0, c, d, sigma_row^2, black, rate, saturation, shape, DSNU^2, PRNU^2.
+    inner = np.diag([0.0] * 7 + [level_sigma**2, dark.shape.variance, dark.dsnu_DN2.variance, PRNU2.variance])
+    inner[:4, :4], inner[4, 4], inner[5:7, 5:7] = transfer, dark.row_DN2.variance, dark.levels_cov
+    jacobian, steeper = np.zeros((11, 11)), c + 2 * d * full_DN
+    jacobian[[0, 1, 2, 4], [0, 5, 7, 8]] = 1.0
+    jacobian[3, [0, 1, 4]] = -sigma_d / K**2, by_total / K, by_total / K
+    jacobian[5, 4], jacobian[9, 10] = by_row, by_response
+    jacobian[7, [0, 6]] = -rate / K**2, 1 / K
+    jacobian[8, [0, 9]] = -spread / K**2, by_spread / K
+    jacobian[10, [2, 3, 5, 7]] = full_DN, full_DN**2, -steeper, steeper
     return values, jacobian @ inner @ jacobian.T

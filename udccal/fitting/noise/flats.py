@@ -14,7 +14,7 @@ from udccal.fitting.noise.codes import excess_kurtosis
 from udccal.fitting.noise.frame_moments import Shared, stacked
 from udccal.fitting.noise.moments import NoiseMoments, steadied
 from udccal.fitting.noise.patterns import DarkTerms
-from udccal.fitting.noise.transfer import DarkVariance, Levels, Six, TransferFit, robust_transfer
+from udccal.fitting.noise.transfer import DarkVariance, Levels, Seven, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]
 
@@ -37,7 +37,7 @@ class Curve:
     inside: Levels
     levels: Levels
     choice: Choice[TransferFit] | None
-    apart: Six = field(default_factory=lambda: np.zeros(6))
+    apart: Seven = field(default_factory=lambda: np.zeros(7))
 
     @property
     def fit(self) -> TransferFit:
@@ -46,12 +46,12 @@ class Curve:
         return self.choice.best.fit
 
     @property
-    def values(self) -> Six:
+    def values(self) -> Seven:
         """The fit's values; zeros where there is none."""
-        return np.zeros(6) if self.choice is None else self.fit.values
+        return np.zeros(7) if self.choice is None else self.fit.values
 
     @property
-    def cov(self) -> Float[np.ndarray, "6 6"]:
+    def cov(self) -> Float[np.ndarray, "7 7"]:
         """Covariance of the values, with what the variances' misfit and the choice of an order add."""
         assert self.choice is not None, "asked for where there are usable levels"
         orders = self.choice.spread(self.fit.samples, lambda of: of.values)
@@ -92,7 +92,11 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
         return replace(empty, levels=levels, choice=choice)
 
     found = up_to(rules.fit_up_to)
-    if not found.choice or not (found.fit.misfit.found or found.off_its_end is not None):
+    if not found.choice:
+        return found
+    # Light that is unsteady beside such a bend may be a response of another kind.
+    otherwise = found.fit.order.cubic and found.fit.order.unsteady
+    if not (found.fit.misfit.found or otherwise or found.off_its_end is not None):
         return found
     for part in (rules.narrow_up_to, 0.5 * rules.fit_up_to):
         narrow = up_to(part)

@@ -23,6 +23,8 @@ Grid = Float[np.ndarray, "groups_y groups_x"]
 Picture = Float32[np.ndarray, "rows columns"]
 # Rows of the sensor's middle that are enough to compare neighbours.
 MIDDLE_ROWS = 512
+# Rows that agree by chance in a pair of frames: fewer are none.
+_BY_CHANCE = 1e-9
 
 
 def product_sum(first: Picture, second: Picture) -> float:
@@ -99,7 +101,7 @@ class Moments:
     hits, and left out; ``outlier_powers`` are the sums of the second, fourth and sixth powers of their differences
     from the first frame. ``shared`` is the noise that neighbours have in common in the first two frames. ``far`` is how
     many pixels lie outside the window of the dark histograms in both of these, and what they have of all squares.
-    ``repeated``: some frames are copies of others.
+    ``repeated``: some frames are copies of others. ``torn``: so many rows of the second frame are those of the first.
     """
 
     exposure_s: float
@@ -120,6 +122,7 @@ class Moments:
     shared: Shared
     far: tuple[int, float]
     repeated: bool
+    torn: int
 
     @property
     def frames(self) -> int:
@@ -189,6 +192,18 @@ def _fingerprint(frame: Codes) -> int | None:
     return hash(sample.tobytes()) if high > low else None
 
 
+def _torn_rows(first: Codes, second: Codes) -> int:
+    """How many rows of two frames agree that chance makes differ; none where it does not make all of them differ."""
+    same = (first == second).mean(axis=1)
+    agree = np.flatnonzero(same == 1.0)
+    if not agree.size or agree.size == len(first):
+        return 0
+    # Rows of one code, at an end of the range or of dead columns, may well agree.
+    low, high = np.percentile(first[agree], [16.0, 84.0], axis=1)
+    by_chance = len(first) * float(np.median(same[same < 1.0])) ** first.shape[1]
+    return int(np.count_nonzero(high > low)) if by_chance < _BY_CHANCE else 0
+
+
 class _Sums:
     """Sums over frames of what differs from the first one.
 
@@ -204,12 +219,15 @@ class _Sums:
         self._total, self._squares = np.zeros(first.shape, np.float32), np.zeros_like(self._counts)
         self._outliers, self._powers = 0, np.zeros(3)
         self._shared: Shared | None = None
+        self._torn = 0
         self._marks = [_fingerprint(first)]
         none = *(np.zeros(side) for side in first.shape), np.zeros_like(self._counts), np.zeros(far.size)
         self._seen = [(*none, *self._at_peak(first))]
 
     def add(self, frame: Codes) -> None:
         """Count one more frame."""
+        if self._shared is None:
+            self._torn = _torn_rows(self._first, frame)
         difference = self._without_hits(cv2.subtract(frame, self._first, dtype=cv2.CV_32F))
         rows = difference.mean(axis=1, dtype=np.float64)
         difference -= rows[:, None]
@@ -261,6 +279,7 @@ class _Sums:
             shared=self._shared or Shared(),
             far=(self._far.size, float(np.var(far, axis=0).sum()) * number),
             repeated=len(set(marks)) < len(marks),
+            torn=self._torn,
         )
         return Averaged(exposure_s, mean_DN, number), moments
 

@@ -43,7 +43,7 @@ def _names(data: NoiseMoments) -> list[str]:
 
 def notes(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, uneven: Pattern, shared: Shared,
-    values: Float[np.ndarray, "11"], bent_too_far: bool,
+    values: Float[np.ndarray, "11"],
 ) -> Iterator[str]:  # fmt: skip
     """Sentences for a person; ``values`` are the estimates."""
     if not (curve.full.any() or curve.pile):
@@ -90,14 +90,20 @@ def notes(
         )
     if curve.fit.order.curved:
         yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."
-    if bent_too_far:
+    if curve.fit.order.cubic:
+        # The term's parabola meets the response at full scale: the difference, d z^2 (full - z), is largest at 2/3.
+        off = 4 / 27 * float(curve.values[6]) * (values[2] - values[1]) ** 2
+        found = "It is no parabola, and the term's parabola is right for small signals and at full scale"
+        yield f"{found}: in between, signals are off by up to {100 * abs(off):.2g} % of full scale."
+    if curve.fit.at_bound:
         yield "The response bends more than the model can describe. Check the exposures and the lamp."
     if curve.fit_up_to < 0.9:
         yield f"Flats above {100 * curve.fit_up_to:.0f} % of saturation do not follow the curve and are left out."
         if rough_median(data.flat_stack.mean_DN) - dark.black_DN > curve.fit_up_to * (curve.ceiling_DN - dark.black_DN):
             yield "The flat stack is brighter than that: PRNU1288 holds for a curve that goes on."
     if curve.fit.order.unsteady:
-        yield f"The light differs by {100 * curve.fit.scatter:.2g} % from level to level."
+        found = f"The light differs by {100 * curve.fit.scatter:.2g} % from level to level"
+        yield f"{found}{', or the response bends otherwise and K is off' * curve.fit.order.cubic}."
 
 
 def _of_darks(data: NoiseMoments, dark: DarkTerms) -> Iterator[str]:

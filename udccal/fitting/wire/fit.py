@@ -34,17 +34,16 @@ from udccal.fitting.wire.data import (
 from udccal.fitting.wire.jacobian import WireProblem, values_at, weighed_at
 from udccal.fitting.wire.map_error import (
     MapJacobian,
-    Misfits,
     Strengths,
     map_jacobian,
     mean_one,
-    misfits,
     omitted,
     strengths_of,
     tied_sigma,
     unseen,
 )
 from udccal.fitting.wire.parameters import SHAPE_NAMES, SOLVER, Kind, Parameters, WireRules, ideal_wire, parameters_of
+from udccal.fitting.wire.residuals import Misfits, misfits
 from udccal.fitting.wire.search import Descent, Search, best_of_columns, likely_columns
 from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
@@ -267,6 +266,7 @@ def _result(
         ("map_sigma_by_dark_level", 100 * by_dark, "%"),
         ("residual_pattern_p_value", found.pattern.test.p_value, "1"),
         ("residual_lines_p_value", found.lines.test.p_value, "1"),
+        ("residual_spots_p_value", found.spots.test.p_value, "1"),
         ("modulation_peak_to_peak", 100 * np.ptp(values_at(term, seen.pixels.thinned(8 * BLOCK))[0]), "%"),
         ("harmonics", len(term.harmonics), "1"),
         ("parameters", joint.parameters.linear, "1"),
@@ -293,7 +293,7 @@ def _result(
         samples=seen.pixels.used,
         candidates=joint.orders.candidates,
         diagnostics=tuple(Diagnostic(name, float(value), unit) for name, value, unit in diagnostics),
-        notes=tuple(_notes(joint, found, left_out, rules)),
+        notes=tuple(_notes(joint, found, left_out, shape, rules)),
         outliers=outliers,
         residuals=residual_sample((seen.pixels.scaled[drawn] + 1) / 2 * [shape[1] - 1, shape[0] - 1], seen.z[drawn]),
         posterior=posterior,
@@ -311,7 +311,7 @@ def _trimmed(wire: Wire) -> Wire:
     return replace(wire, amplitudes=beside, **parts)
 
 
-def _notes(joint: _Joint, found: Misfits, left_out: float, rules: WireRules) -> Iterator[str]:
+def _notes(joint: _Joint, found: Misfits, left_out: float, shape: tuple[int, int], rules: WireRules) -> Iterator[str]:
     if joint.parameters.panel:
         prior = joint.last.problem.prior
         off = (prior.root @ (joint.x - prior.mean))[joint.parameters.linear :]
@@ -346,6 +346,14 @@ def _notes(joint: _Joint, found: Misfits, left_out: float, rules: WireRules) -> 
         yield (
             f"Columns or rows of the sensor differ by {100 * lines.sigma:.2g} % (p = {lines.test.p_value:.1g}), which "
             "the map lacks and the sigmas include. Check the gains of the sensor's columns, and the light for stripes."
+        )
+    if found.spots.test.found:
+        spot, (rows, columns) = found.spot, shape
+        at = f"about column {columns * spot.across:.0f}, row {rows * spot.down:.0f}"
+        kind = "brighter" if spot.off > 0 else "darker"
+        yield (
+            f"The flat is {100 * abs(spot.off):.2g} % {kind} than the map {at}, in {columns * spot.size[0]:.0f} x "
+            f"{rows * spot.size[1]:.0f} px, and the map may be so much off there. Look for dust, glare and shadows."
         )
     if joint.impossible:
         yield "An opening came out wider than its period: check panel, pitch and lens in the rig description."

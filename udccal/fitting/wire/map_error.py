@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 from scipy.linalg import block_diag
 
 from udccal.fitting.engine.gaussian import Posterior, square_root
-from udccal.fitting.engine.misfit import MisfitTest, chi2_test, excess_sigma, excess_variance, sharper
+from udccal.fitting.engine.misfit import excess_variance
 from udccal.fitting.engine.report import coarse
-from udccal.fitting.wire.data import BLOCK, TILES, Pixels, Weighed, ideal_points, scaled_places, tile_numbers
-from udccal.fitting.wire.jacobian import LEAST_VARIANCE, block_jacobian, rays_at, values_at, with_harmonics
+from udccal.fitting.wire.data import BLOCK, Pixels, Weighed, ideal_points, scaled_places
+from udccal.fitting.wire.jacobian import block_jacobian, values_at, with_harmonics
 from udccal.fitting.wire.parameters import Harmonics, Kind, Parameters, WireRules, WireStart, possible_harmonics
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire
@@ -99,98 +99,6 @@ def map_jacobian(parameters: Parameters, x: _Vector, shape: tuple[int, int]) -> 
     rows[parameters.of(Kind.SITE)] = 0.0
     of_mean = rows.mean(axis=1)
     return MapJacobian(value, rows - of_mean[:, None] * value, of_mean)
-
-
-@final
-@dataclass(frozen=True)
-class Misfit:
-    """Relative model error of the map by patterned residuals, RMS over the sensor; 0 where chance explains them."""
-
-    sigma: float
-    test: MisfitTest
-
-
-@final
-@dataclass(frozen=True)
-class Misfits:
-    """What residuals show of the map's model error: a pattern in the panel's period, and lines of the sensor.
-
-    ``excess`` is the RMS of residuals beyond noise where they are so large that the fit is poor, else 0.
-    """
-
-    pattern: Misfit
-    lines: Misfit
-    excess: float
-
-    @property
-    def found(self) -> bool:
-        """Whether chance does not explain the residuals' means."""
-        return self.pattern.test.found or self.lines.test.found
-
-    @property
-    def sigma(self) -> float:
-        """Relative model error of the map."""
-        return max(float(np.hypot(self.pattern.sigma, self.lines.sigma)), self.excess)
-
-
-def misfits(
-    tested: Weighed, wire: Wire | None, statistical: float, held_out: bool, variance: float, rules: WireRules
-) -> Misfits:
-    """All that residuals show; ``variance`` is that of the fit's residuals in units of the noise's."""
-    # Columns and rows of the sensor, each by the place of its pixels.
-    sides = (np.unique(side, return_inverse=True)[1] for side in tested.pixels.scaled.T)
-    relative = values, weight, scale = _relative(tested)
-    columns, rows = (_of_means(relative, side, statistical, held_out) for side in sides)
-    test = sharper(columns.test, rows.test)
-    lines = Misfit(float(np.hypot(columns.sigma, rows.sigma)) if test.found else 0.0, test)
-    beyond = float(np.sum(values**2)) / max(int(np.count_nonzero(weight)), 1) * max(1 - 1 / scale, 0.0)
-    excess = float(np.sqrt(beyond)) if variance > rules.worst_variance else 0.0
-    return Misfits(misfit(tested, wire, statistical, held_out), lines, excess)
-
-
-def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: bool) -> Misfit:
-    """Test means over bins of the rows' and the columns' period, tile by tile, against chance.
-
-    Noise has no pattern; a misfit has. ``wire`` gives the phase of each ray in the period; without a panel, bins are
-    parts of a tile. ``held_out`` pixels show the fit's ``statistical`` errors as well; these are accounted for.
-    """
-    # Bins of a period of the rows and of the columns, once finer in the one, once in the other.
-    binned = (_bins(tested.pixels, wire, down, across) for down, across in ((12, 3), (3, 12)))
-    relative = _relative(tested)
-    found = [_of_means(relative, bins, statistical, held_out) for bins in binned]
-    test = sharper(*(one.test for one in found))
-    return Misfit(min(found, key=lambda one: one.test.p_value).sigma if test.found else 0.0, test)
-
-
-def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.ndarray, " n"]:
-    """Number of each pixel's bin in its tile: by its ray's phase in rows and columns, or by place without a panel."""
-    by_place = 0.5 * (pixels.scaled.T + 1) * np.array([[TILES[1]], [TILES[0]]])
-    periods = rays_at(wire, pixels).periods if wire is not None else by_place
-    phase = periods - np.floor(periods)
-    x, y = (np.minimum((p * n).astype(np.int64), n - 1) for p, n in zip(phase, (across, down), strict=True))
-    return np.asarray((tile_numbers(pixels.scaled) * down + y) * across + x)
-
-
-def _relative(tested: Weighed) -> _Relative:
-    """Residuals relative to the expected signal, their weights, and their variance in units of the noise's."""
-    pixels, expected = tested.pixels, tested.expected
-    used = (pixels.weight > 0) & (expected > 0)
-    values = np.where(used, pixels.value / np.where(used, expected, 1.0) - 1, 0.0)
-    weight = np.where(used, pixels.weight * expected**2, 0.0)
-    scale = float(np.sum(weight * values**2)) / max(int(used.sum()), 1)
-    return values, weight, max(scale, LEAST_VARIANCE)
-
-
-def _of_means(relative: _Relative, group: Int[np.ndarray, " n"], statistical: float, held_out: bool) -> Misfit:
-    """Test the means of groups of pixels against chance; see ``misfit``."""
-    values, weight, scale = relative
-    full = np.bincount(group, weight > 0) >= 4
-    total = np.bincount(group, weight)[full]
-    mean = np.bincount(group, weight * values)[full] / total
-    noise = scale / total
-    noise = noise + statistical**2 if held_out else np.maximum(noise - statistical**2, 0.1 * noise)
-    test = chi2_test(float(np.sum(mean**2 / noise)), float(len(mean)))
-    return Misfit(excess_sigma(mean**2, noise, np.ones(len(mean)), float(len(mean))), test)
 
 
 @final
