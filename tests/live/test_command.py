@@ -174,6 +174,13 @@ def test_a_log_that_would_replace_what_the_run_reads_is_refused(
     ):
         with pytest.raises(UdccalError, match=words):
             run_live(Output(), replace(wanted, log=log))
+    for sink, words in (
+        (f"images:{raw}", "apart from the frames"),
+        (f"video:{raw}/a.mp4", "apart from the frames"),
+        (f"video:{profile_folder}/a.mp4", "inside the profile"),
+    ):
+        with pytest.raises(UdccalError, match=words):
+            run_live(Output(), replace(wanted, sink=sink))
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
 
 

@@ -157,7 +157,9 @@ def test_one_frame_is_checked_before_the_profile_is_prepared(profile: Profile, m
         ({"tile_rows": 95}, "PlanOptions.tile_rows as a whole number from 96"),
         ({"grid_columns": np.nan}, "PlanOptions.grid_columns .* found nan"),
         ({"network_views": 5}, "PlanOptions.network_views as a whole number from 1 to 4"),
-        ({"interpolation": "cubic"}, "PlanOptions.interpolation of .* found 'cubic'"),
+        ({"interpolation": "cubic"}, "to be one of Interpolation.LINEAR, .* found 'cubic'"),
+        ({"interpolation": 2}, "to be one of .*Interpolation.CUBIC, .* found 2"),
+        ({"kernel_rows": 256}, "PlanOptions.kernel_rows to be odd, found 256"),
     ],
 )
 def test_options_that_cannot_be_are_refused(options: dict[str, Any], message: str) -> None:

@@ -71,6 +71,12 @@ def test_a_folder_to_keep_that_is_no_path_is_refused(profile: Profile) -> None:
         made(Restorer, profile, Tier.preview, keep=5)
 
 
+def test_a_folder_to_keep_that_is_a_file_is_refused(profile: Profile, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(RestorationError, match="a folder that keeps what is computed, found the file"):
+        Restorer.from_profile(profile, Tier.preview, keep=tmp_path / "file")
+
+
 def test_absent_terms_cost_nothing(profile: Profile) -> None:
     def absent(term: FitResult) -> FitResult:
         return replace(term, status=FitStatus.ABSENT)

@@ -49,7 +49,10 @@ def test_a_tier_is_quick_enough_then_good_enough(wish: Wish, tier: Tier) -> None
     ("wish", "message"),
     [
         (Wish(budget_ms=9.0), "at least 10 ms, which the fastest tier, preview, needs .* found 9 ms"),
-        (Wish(min_psnr_dB=36.1), "found 36.1 dB: the best within the budget, accurate, is expected to reach 36.0 dB"),
+        (
+            Wish(min_psnr_dB=36.1),
+            "found 36.1 dB: the best, accurate, is expected to reach 36.0 dB .* Ask for less.$",
+        ),
         (Wish(budget_ms=250.0, min_psnr_dB=34.0), "the best within the budget, fast, is expected to reach 33.0 dB"),
     ],
 )

@@ -80,6 +80,12 @@ def test_an_empty_picture_is_refused() -> None:
         Tone(1.0).rgb8(np.zeros((0, 4, 3), np.float32))
 
 
+@pytest.mark.parametrize("picture", [np.full((2, 2, 3), np.nan), np.zeros((0, 2, 3))])
+def test_a_picture_without_light_that_is_a_number_has_no_exposure(picture: np.ndarray) -> None:
+    with pytest.raises(RestorationError, match="Expected a picture whose light is numbers"):
+        display_exposure(picture)
+
+
 def test_light_far_beyond_white_is_white() -> None:
     linear = np.array([[[1.0, 1e5, 1e30], [0.0, -1.0, 0.5]]], np.float32)
     tone = Tone(3.0)

@@ -49,7 +49,8 @@ class PlanOptions:
         workers: threads where they save time.
 
     Raises:
-        RestorationError: when one is no whole number that it may be, or no ``Interpolation``.
+        RestorationError: when one is no whole number that it may be, the size of kernels is even, or
+            ``interpolation`` is no ``Interpolation``.
     """
 
     kernel_rows: int = KERNEL_ROWS
@@ -66,10 +67,15 @@ class PlanOptions:
     def __post_init__(self) -> None:
         for name, (least, most) in _BOUNDS.items():
             check_count(getattr(self, name), f"PlanOptions.{name}", least, most, RestorationError)
+        for name in ("kernel_rows", "kernel_columns"):
+            if (size := getattr(self, name)) % 2 == 0:
+                raise RestorationError(
+                    f"Expected PlanOptions.{name} to be odd, found {size}: a kernel has a middle. Give {size + 1}."
+                )
         if not isinstance(self.interpolation, Interpolation):
+            names = ", ".join(f"Interpolation.{each.name}" for each in Interpolation)
             raise RestorationError(
-                f"Expected PlanOptions.interpolation of {', '.join(map(str, Interpolation))}, found "
-                f"{self.interpolation!r:.80}. Give one of these."
+                f"Expected PlanOptions.interpolation to be one of {names}, found {self.interpolation!r:.80}. Give one."
             )
 
 

@@ -23,7 +23,9 @@ from jaxtyping import jaxtyped
 from pydantic import BaseModel
 
 from udccal import __version__
+from udccal.arguments import check_is_path
 from udccal.compilation import compilation_folder, private_folder
+from udccal.errors import RestorationError
 from udccal.io.atomic import atomic_path
 
 if TYPE_CHECKING:
@@ -44,6 +46,20 @@ _SUFFIX = ".prepared"
 def prepared_folder() -> Path:
     """Where programs that own their process keep what they prepare: beside the compilations."""
     return compilation_folder().parent / "prepared"
+
+
+def checked_folder(keep: Any) -> Path | None:
+    """Return the folder that a caller gave for entries, which need not exist; None for none.
+
+    Raises:
+        RestorationError: when it is no path, or a file's.
+    """
+    if keep is None:
+        return None
+    check_is_path(keep, "a folder that keeps what is computed", RestorationError)
+    if (folder := Path(keep)).is_file():
+        raise RestorationError(f"Expected a folder that keeps what is computed, found the file {folder}. Name another.")
+    return folder
 
 
 def prepared_bytes(folder: Path) -> int:

@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
-from udccal.arguments import check_is_path, check_kind
+from udccal.arguments import check_kind
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.kernels import fitted_size
@@ -34,7 +34,7 @@ from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.linear import least_saturated_e, saturated, to_electrons, variance_e2
 from udccal.restoration.panel_mask import PanelMask, mask_mosaic
 from udccal.restoration.plan import PlanOptions, checked_options, kernel_grid
-from udccal.restoration.prepared import kept
+from udccal.restoration.prepared import checked_folder, kept
 from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
@@ -146,13 +146,12 @@ class Restorer:
 
         Raises:
             RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
-                finite, there is no such tier or stage, options are no ``PlanOptions``, or ``keep`` is no path.
+                finite, there is no such tier or stage, options are no ``PlanOptions``, or ``keep`` is no path of a
+                folder.
         """
         check_profile(profile)
         check_stages(without)
-        if keep is not None:
-            check_is_path(keep, "a folder that keeps what is computed", RestorationError)
-        options, tier, keep = checked_options(options), tier_named(tier), None if keep is None else Path(keep)
+        options, tier, keep = checked_options(options), tier_named(tier), checked_folder(keep)
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
         view = kept_view(geometry, rig, keep)

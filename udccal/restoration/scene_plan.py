@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal, final
@@ -136,7 +137,7 @@ def chosen_tier(tiers: tuple[TierForecast, ...], wish: Wish) -> Tier:
     """
     if wish == Wish():
         return DEFAULT_TIER
-    budget = float("inf") if wish.budget_ms is None else wish.budget_ms
+    budget = math.inf if wish.budget_ms is None else wish.budget_ms
     quick = [each for each in tiers if each.frame_ms <= budget]
     if not quick:
         least = min(tiers, key=lambda each: each.frame_ms)
@@ -154,9 +155,10 @@ def chosen_tier(tiers: tuple[TierForecast, ...], wish: Wish) -> Tier:
     good = [each for each, psnr_dB in told.items() if psnr_dB >= wish.min_psnr_dB]
     if not good:
         best = max(told, key=lambda each: told[each])
+        within, more = (" within the budget", ", or give more time") if math.isfinite(budget) else ("", "")
         raise RestorationError(
-            f"Expected a PSNR that a tier reaches, found {wish.min_psnr_dB:g} dB: the best within the budget, "
-            f"{best.tier}, is expected to reach {told[best]:.1f} dB on this frame. Ask for less, or give more time."
+            f"Expected a PSNR that a tier reaches, found {wish.min_psnr_dB:g} dB: the best{within}, {best.tier}, is "
+            f"expected to reach {told[best]:.1f} dB on this frame. Ask for less{more}."
         )
     return good[0].tier
 

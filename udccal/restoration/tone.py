@@ -97,8 +97,13 @@ def display_exposure(
 
     Where the percentile is below ``least``, it brings this to 0.9. Light from ``clips`` on is white, however much there
     is of it: nothing is known of its detail.
+
+    Raises:
+        RestorationError: when the picture is empty, or some of its light is no number.
     """
-    level = float(np.percentile(linear, PERCENTILE))
+    level = float(np.percentile(linear, PERCENTILE)) if linear.size else math.nan
+    if math.isnan(level):
+        raise RestorationError("Expected a picture whose light is numbers, found NaN or no pixel. Give a restored one.")
     return max(((LEVEL + 0.055) / 1.055) ** 2.4 / max(level, least), 1 / clips)
 
 

@@ -88,7 +88,7 @@ def _check_start(path: Path) -> None:
     if _START.match(start) is None:
         raise FileFormatError(
             f"Expected {path} to begin as a camera raw file does, found no header, so that its size and pattern would "
-            "be a guess. Convert it to DNG, or to 16-bit TIFF or PNG with its pattern and bits given."
+            "be a guess. Convert it to DNG; as frames of --camera files, 16-bit TIFF or PNG do as well."
         )
 
 

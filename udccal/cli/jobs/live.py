@@ -15,6 +15,7 @@ from typing import Final, Literal, final
 
 import jax
 
+from udccal.cli.jobs.apart import check_apart
 from udccal.cli.jobs.live_cameras import LiveCamera
 from udccal.cli.jobs.log_file import check_log, log_file
 from udccal.cli.jobs.panel_picture import read_panel_picture
@@ -37,6 +38,8 @@ from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.runtime import Restorer
 from udccal.tiers import Tier
 
+# Sinks whose target is a file or a folder.
+_FILES: Final = ("video", "images")
 _ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is not on every system
 
 
@@ -82,6 +85,7 @@ def run_live(output: Output, wanted: LiveRun) -> None:
     """
     path = find_profile(wanted.profile)
     check_log(wanted.log, path, wanted.camera.files, wanted.panel_picture)
+    _check_sink(wanted)
     keep_compilations()
     device = _gpu() if wanted.device == "gpu" else None
     sink = _sink(wanted)
@@ -119,6 +123,18 @@ def run_live(output: Output, wanted: LiveRun) -> None:
         write(whole)
     output.table(_table(whole))
     output.result(whole)
+
+
+def _check_sink(wanted: LiveRun) -> None:
+    """Refuse a video or a folder of images among what the run reads."""
+    kind, _, target = wanted.sink.partition(":")
+    if kind not in _FILES or not target:
+        return
+    place, files = Path(target), wanted.camera.files
+    check_apart(place, wanted.panel_picture, wanted.log)
+    folder = place if kind == "images" else place.parent
+    if files is not None and folder.resolve() == files.resolve():
+        raise LiveError(f"Expected a sink apart from the frames in {files}, found {place} among them. Choose another.")
 
 
 def _sink(wanted: LiveRun) -> Sink:
