@@ -81,3 +81,11 @@ def test_flats_that_clip_in_their_middle_alone_show_saturation(brightest: float)
     assert any("No flat reached saturation" in note for note in result.notes) != seen
     assert abs(found.value - true) < 3 * found.sigma
     assert (found.sigma < 0.5) == seen
+
+
+@pytest.mark.parametrize("top_code", [4095, None])
+def test_a_largest_code_that_nobody_gave_is_told_as_a_guess(top_code: int | None) -> None:
+    levels, stack = capture(replace(PLAIN, levels=PLAIN.levels[:-1]), 3)
+    notes = fit_noise(NoiseData(levels, stack, top_code=top_code)).notes
+    assert any("4095 DN, is taken for it" in note for note in notes)
+    assert any("top_code was not given" in note for note in notes) == (top_code is None)

@@ -50,7 +50,7 @@ class NoiseMoments:
     ``dark_moments`` are those of the pairs in ``darks``; both stacks have about the same exposure; colour sites repeat
     after ``period`` samples (1: monochrome). ``dark_seen`` and ``flat_seen`` are moments of the stacks' frames. They
     are None for an average that was made elsewhere, whose variance would include the lamp's flicker, and for frames of
-    a pair, which must not count twice. ``rules`` are those of the whole fit.
+    a pair, which must not count twice. ``rules`` are those of the whole fit. ``top_guessed``: ``top_DN`` was not given.
     """
 
     darks: tuple[DarkPair, ...]
@@ -64,6 +64,7 @@ class NoiseMoments:
     dark_seen: Moments | None = None
     flat_seen: Moments | None = None
     rules: NoiseRules = field(default_factory=NoiseRules)
+    top_guessed: bool = False
 
     @property
     def rounding_DN2(self) -> float:
@@ -152,4 +153,4 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         stacks = [(seen(codes("dark", near), near)[0], None), (seen(codes("bright", middle), middle)[0], None)]
     (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
     frames = histograms, dark_moments, flats, dark_stack, flat_stack
-    return NoiseMoments(*frames, q_DN, float(top), period, dark_seen, flat_seen, rules)
+    return NoiseMoments(*frames, q_DN, float(top), period, dark_seen, flat_seen, rules, data.top_code is None)

@@ -47,7 +47,8 @@ def notes(
 ) -> Iterator[str]:  # fmt: skip
     """Sentences for a person; ``values`` are the estimates."""
     if not (curve.full.any() or curve.pile):
-        yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
+        what = "as many bits as the codes have (top_code was not given)" if data.top_guessed else "the converter"
+        yield f"No flat reached saturation; the largest code of {what}, {values[2]:.0f} DN, is taken for it."
     if not dark.white:
         found = "Rounding or cut-off codes bend the dark codes: black, dark noise, row noise, dark current and DSNU"
         yield f"{found} come from histograms, and hold for read noise of the model's kind (Tukey's lambda)."

@@ -15,6 +15,7 @@ from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
+from udccal.fitting.psf_stamps.bend import Bend, bend_of
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
 from udccal.fitting.psf_stamps.model_error import add_model_error, widen
@@ -131,7 +132,10 @@ def _report(
     # The expected error, then the maps' coefficients, named by colour, element and degrees in x and y.
     size, spread = np.sqrt((term.relative_l2(term.star_px, term.field.reference) ** 2).mean(axis=0))
     cov, names = block_diag(spread**2, map_cov), ["kernel_relative_l2", *_names(state)]
+    bend = bend_of(stamps, state)
     status, note = bad or _verdict(stamps, found, chi2_dof, float(size), term, rules)
+    if status is FitStatus.CONVERGED and bend is not None and bend.size > size:
+        status = FitStatus.POOR_FIT
     return FitResult(
         name="psf",
         term=term,
@@ -151,7 +155,12 @@ def _report(
             Diagnostic("left_out_off", state.left_out_off, "1"),
             Diagnostic("background", float(state.background_e.mean()), "e-"),
         ),
-        notes=(*([note] if note else []), *_told(state), *_quiet(stamps, state, z.size - effective, rules)),
+        notes=(
+            *([note] if note else []),
+            *_told(state),
+            *_bent(bend),
+            *_quiet(stamps, state, z.size - effective, rules),
+        ),
         outliers=_left_out(stamps, state, rules),
         residuals=residual_sample((term.star_px[:, None] + stamps.offset_px)[used], z),
         posterior=Posterior(np.zeros(len(term.factor)), term.factor, term.changed),
@@ -215,6 +224,15 @@ def _told(state: State) -> tuple[str, ...]:
         told = "Error bars include it: the field changes more than its orders follow, or the noise given is wrong."
         notes.append(f"The psf differs from the model by {100 * error:.2g} %. {told}")
     return tuple(notes)
+
+
+def _bent(bend: Bend | None) -> tuple[str, ...]:
+    """Return a note where peaks of bright stars are not those of faint ones."""
+    if bend is None:
+        return ()
+    how, off = "lower" if bend.missing > 0 else "higher", 100 * abs(bend.missing)
+    advice = "Give light that is linear: the noise term's nonlinearity tells how"
+    return (f"Peaks of bright stars are {off:.2g} % {how} than faint ones predict: the response bends. {advice}.",)
 
 
 def _quiet(stamps: Stamps, state: State, dof: float, rules: StampsRules) -> tuple[str, ...]:
