@@ -1,7 +1,8 @@
 """A response that bends: the light of a sample that is missing, in proportion to its square, in bright stars and faint.
 
-Stars of one brightness hide it: their psf is another one. Where brightness differs, peaks of bright stars are lower,
-or higher, than those of faint ones, beside what a star's own place, light and background take up.
+The fitted psf takes up what stars of the mean brightness lack: it is another psf. Brighter stars lack more than that,
+fainter ones less. With brightness from half to one and a half of the mean, 20 stars tell a peak that lacks 8 % to a
+quarter of that, and 40 stars to an eighth; the kernels are then 2 to 3 % wrong.
 """
 
 from __future__ import annotations
@@ -10,13 +11,12 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+from jaxtyping import Float
 
+from udccal.fitting.engine.misfit import SIGNIFICANT, chi2_tail
 from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.model_error import by_star
 from udccal.fitting.psf_stamps.probability import State, expectation
-
-# Sigmas from which a bend is no chance.
-_SURE = 5.0
 
 
 @final
@@ -25,7 +25,7 @@ class Bend:
     """A bend of the response.
 
     Attributes:
-        missing: part of the light that the brightest sample lacks beside the faint ones; negative where it has more.
+        missing: part of its light that the brightest sample lacks; negative where it has more.
         size: by how much it changes kernels, relative L2, root mean square over stars.
     """
 
@@ -34,22 +34,24 @@ class Bend:
 
 
 def bend_of(stamps: Stamps, state: State) -> Bend | None:
-    """Return the bend that residuals show, or None where chance explains it.
-
-    The field follows a part of it, so that both numbers are lower bounds, and so is its significance.
-    """
+    """Return the bend that residuals show, or None where chance explains it."""
     seen = expectation(stamps, state)
-    light = seen.mean_e - np.take_along_axis(state.background_e, stamps.plane, axis=1)
-    root = np.sqrt(np.where(stamps.clipped, 0.0, seen.weight))[..., None]
-    taken = np.linalg.qr(root * by_star(stamps, state, seen))[0]
-    square = root * (light**2)[..., None]
-    square -= taken @ (taken.transpose(0, 2, 1) @ square)
-    information = float((square**2).sum())
-    if information == 0.0:
+    background, of_star = (np.take_along_axis(e, stamps.plane, axis=1) for e in (state.background_e, state.light_e))
+    light = seen.mean_e - background
+    root = np.sqrt(np.where(stamps.clipped, 0.0, seen.weight))
+    taken = np.linalg.qr(root[..., None] * by_star(stamps, state, seen))[0]
+
+    def beside(change_e: Float[np.ndarray, "stars samples"]) -> Float[np.ndarray, "stars samples"]:
+        """What a star's own place, light and background leave of a change, in sigma."""
+        change = (root * change_e)[..., None]
+        return np.asarray((change - taken @ (taken.transpose(0, 2, 1) @ change))[..., 0])
+
+    lacking, common = beside(light**2), beside(light**2 / of_star)
+    contrast = lacking - common * float((lacking * common).sum() / max((common**2).sum(), 1e-300))
+    information = float((contrast**2).sum())
+    missing_per_e = -float((contrast * root * seen.residual).sum()) / max(information, 1e-300)
+    if chi2_tail(missing_per_e**2 * information, 1.0) > SIGNIFICANT:
         return None
-    missing_per_e = -float((square * root * seen.residual[..., None]).sum()) / information
-    if abs(missing_per_e) * information**0.5 < _SURE:
-        return None
-    norm = ((root[..., 0] * light) ** 2).sum(axis=1)
-    size = np.sqrt(np.mean((square**2).sum(axis=(1, 2))[norm > 0] / norm[norm > 0]))
-    return Bend(missing_per_e * float(light[root[..., 0] > 0].max()), abs(missing_per_e) * float(size))
+    norm = ((root * light) ** 2).sum(axis=1)
+    size = float(np.sqrt(np.mean((lacking**2).sum(axis=1)[norm > 0] / norm[norm > 0])))
+    return Bend(missing_per_e * float(light[root > 0].max()), abs(missing_per_e) * size)

@@ -231,8 +231,9 @@ def _bent(bend: Bend | None) -> tuple[str, ...]:
     if bend is None:
         return ()
     how, off = "lower" if bend.missing > 0 else "higher", 100 * abs(bend.missing)
-    advice = "Give light that is linear: the noise term's nonlinearity tells how"
-    return (f"Peaks of bright stars are {off:.2g} % {how} than faint ones predict: the response bends. {advice}.",)
+    found = f"The brightest peak is {off:.2g} % {how} than fainter stars predict: the response bends"
+    wrong = f"and kernels may be {100 * bend.size:.2g} % wrong"
+    return (f"{found}, {wrong}. Give light that is linear: the noise term's nonlinearity tells how.",)
 
 
 def _quiet(stamps: Stamps, state: State, dof: float, rules: StampsRules) -> tuple[str, ...]:
