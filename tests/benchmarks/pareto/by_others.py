@@ -87,9 +87,12 @@ def _deepinv(
     import torch
 
     # deepinv imports torchvision, whose operators of another build of torch do not load; it uses none of them.
-    schemas = torch.library.Library("torchvision", "DEF")
-    for name in ("nms", "qnms"):
-        schemas.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    try:
+        import torchvision  # noqa: F401
+    except (ImportError, RuntimeError):
+        schemas = torch.library.Library("torchvision", "DEF")
+        for name in ("nms", "qnms"):
+            schemas.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
     import deepinv
 
     ky, kx = kernels.shape[-2:]
