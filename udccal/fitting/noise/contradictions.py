@@ -11,6 +11,8 @@ from udccal.fitting.noise.frame_moments import stacked
 from udccal.fitting.noise.moments import NoiseMoments, rough_gain, steadied
 
 PerPair = Float[np.ndarray, " pairs"]
+# Part by which flats about as bright as a stack differ from it.
+_ALIKE = 0.25
 # The limits are wide: light, temperature and black may drift between the pairs and a stack.
 _SORT = "Sort the stack's frames, or leave the stack out."
 
@@ -147,7 +149,13 @@ def _averages(data: NoiseMoments) -> Iterator[str]:
         if seen is not None:
             continue
         levels, noise = np.array(sorted((of.level_DN, of.temporal_DN2) for of in pairs)).T
-        least = max(float(np.interp(stack.mean_DN.mean(), levels, noise)) - data.rounding_DN2, 0.0) / stack.frames
+        mean = float(stack.mean_DN.mean())
+        # Full pixels have hardly any noise: the quietest of the pairs about as bright counts, none beyond all.
+        if mean > levels.max() + float(np.sqrt(noise.max())):
+            continue
+        alike = noise[np.abs(levels - mean) <= _ALIKE * mean]
+        usual = float(alike.min()) if alike.size else float(np.interp(mean, levels, noise))
+        least = max(usual - data.rounding_DN2, 0.0) / stack.frames
         beside = stack.mean_DN[:, data.period :] - stack.mean_DN[:, : -data.period]
         # Rounding, and the mean of two frames without their common noise, leave less.
         if float(np.var(beside)) / 2 < data.rules.quiet * least - data.rounding_DN2 / stack.frames:
