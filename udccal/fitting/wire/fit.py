@@ -349,10 +349,10 @@ def _notes(joint: _Joint, found: Misfits, left_out: float, shape: tuple[int, int
         )
     if found.spots.test.found:
         spot, (rows, columns) = found.spot, shape
-        at = f"about column {columns * spot.across:.0f}, row {rows * spot.down:.0f}"
+        at = f"column {columns * spot.across:.0f}, row {rows * spot.down:.0f}"
         kind = "brighter" if spot.off > 0 else "darker"
         yield (
-            f"The flat is {100 * abs(spot.off):.2g} % {kind} than the map {at}, in {columns * spot.size[0]:.0f} x "
+            f"The flat is {100 * abs(spot.off):.2g} % {kind} than the map about {at}, in {columns * spot.size[0]:.0f} x "
             f"{rows * spot.size[1]:.0f} px, and the map may be so much off there. Look for dust, glare and shadows."
         )
     if joint.impossible:
