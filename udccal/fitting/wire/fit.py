@@ -352,8 +352,9 @@ def _notes(joint: _Joint, found: Misfits, left_out: float, shape: tuple[int, int
         at = f"column {columns * spot.across:.0f}, row {rows * spot.down:.0f}"
         kind = "brighter" if spot.off > 0 else "darker"
         yield (
-            f"The flat is {100 * abs(spot.off):.2g} % {kind} than the map about {at}, in {columns * spot.size[0]:.0f} x "
-            f"{rows * spot.size[1]:.0f} px, and the map may be so much off there. Look for dust, glare and shadows."
+            f"The flat is {100 * abs(spot.off):.2g} % {kind} than the map about {at}, in "
+            f"{columns * spot.size[0]:.0f} x {rows * spot.size[1]:.0f} px, and the map may be so much off "
+            "there. Look for dust, glare and shadows."
         )
     if joint.impossible:
         yield "An opening came out wider than its period: check panel, pitch and lens in the rig description."
