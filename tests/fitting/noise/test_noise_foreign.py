@@ -274,6 +274,7 @@ def test_a_response_that_saturates_softly_is_told_where_it_begins_to(seed: int) 
     for name, truth in (("K_DN_per_e", 0.36), ("sigma_d_e", 4.0)):
         assert abs(z(result, name, truth)) < 3.0, name
     assert not noted(fit_noise(data), "do not follow")
+    assert not noted(fit_noise(data), "All variances")
 
 
 def test_a_step_that_grows_with_the_signal_is_told() -> None:

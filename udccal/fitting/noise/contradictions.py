@@ -157,10 +157,11 @@ def _averages(data: NoiseMoments) -> Iterator[str]:
         usual = float(alike.min()) if alike.size else float(np.interp(mean, levels, noise))
         least = max(usual - data.rounding_DN2, 0.0) / stack.frames
         beside = stack.mean_DN[:, data.period :] - stack.mean_DN[:, : -data.period]
+        found2 = float(np.var(beside)) / 2
         # Rounding, and the mean of two frames without their common noise, leave less.
-        if float(np.var(beside)) / 2 < data.rules.quiet * least - data.rounding_DN2 / stack.frames:
+        if found2 < data.rules.quiet * least - data.rounding_DN2 / stack.frames:
             expected = f"Expected pixels of the {name} average to differ by {least**0.5:.3g} DN at least, as those of"
-            found = f"{stack.frames} frames do, found {(np.var(beside) / 2) ** 0.5:.3g} DN"
+            found = f"{stack.frames} frames do, found {found2**0.5:.3g} DN"
             yield f"{expected} {found}: it may be the mean of more frames, or smoothed. Give the number that it has."
 
 

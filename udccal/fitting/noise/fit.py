@@ -22,7 +22,7 @@ from udccal.fitting.noise.frame_moments import bins, stacked
 from udccal.fitting.noise.moments import NoiseMoments, reduced, rough_gain
 from udccal.fitting.noise.notes import left_out, notes
 from udccal.fitting.noise.patterns import DarkTerms, Pattern, prnu, rough_median
-from udccal.fitting.noise.response import linear_mean, temporal_variance
+from udccal.fitting.noise.response import linear_mean, steepness, temporal_variance
 from udccal.fitting.noise.saturation import find_saturation
 from udccal.models.noise import Noise
 from udccal.numerics import in_float64
@@ -170,8 +170,8 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> Patter
         signal = bright.mean_DN.astype(np.float32) - np.float32(dark.black_DN + rate * bright.exposure_s)
         at_no_light += dark.dsnu_DN2.value
     level = max(rough_median(signal), 1e-6)
-    z = float(linear_mean(*(np.array([[value]]) for value in (level, c, d, K)))[0, 0])
-    steep = 1 - (2 * c + 3 * d * z) * z
+    z = float(linear_mean(*np.array([[level], [c], [d], [K]]))[0])
+    steep = steepness(z, c, d)
     shot = temporal_variance(z, K, 0.0, c, 0.0, gain_noise2, d) / level / bright.frames
     found = prnu(signal, at_no_light, shot, data.period, data.rules.defect_sigma)
     # Where the response bends, a relative change of light is a smaller relative change of signal.

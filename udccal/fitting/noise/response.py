@@ -13,14 +13,18 @@ Means = Float[np.ndarray, "*means"]
 _ROUNDS, _LEAST_SLOPE = 4, 0.1
 
 
+def steepness(signal_DN, curvature_per_DN, cubic=0.0):  # type: ignore[no-untyped-def]
+    """The response's derivative at a linear signal; arguments and result are numpy or JAX arrays."""
+    return 1 - (2 * curvature_per_DN + 3 * cubic * signal_DN) * signal_DN
+
+
 def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_DN2, gain_noise2=0.0, cubic=0.0):  # type: ignore[no-untyped-def]
     """Temporal variance in DN^2 (EMVA 1288, clause 6) of a linear signal z above black, as in ``transfer``.
 
     Arguments and result are numpy or JAX arrays; the curvature c is 0 for a linear response, the rounding q^2 / 12.
     """
     light = (K_DN_per_e + gain_noise2 * signal_DN) * signal_DN
-    slope = 1 - (2 * curvature_per_DN + 3 * cubic * signal_DN) * signal_DN
-    return light * slope**2 + V0_DN2 + rounding_DN2
+    return light * steepness(signal_DN, curvature_per_DN, cubic) ** 2 + V0_DN2 + rounding_DN2
 
 
 def linear_mean(mean_DN: Means, curvature: Means, cubic: Means, K_DN_per_e: Means) -> Means:

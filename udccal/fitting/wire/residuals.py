@@ -91,7 +91,11 @@ def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: boo
     # Bins of a period of the rows and of the columns, once finer in the one, once in the other.
     binned = (_bins(tested.pixels, wire, down, across) for down, across in ((12, 3), (3, 12)))
     relative = _relative(tested)
-    found = [_of_means(relative, bins, statistical, held_out) for bins in binned]
+    return _sharpest([_of_means(relative, bins, statistical, held_out) for bins in binned])
+
+
+def _sharpest(found: list[Misfit]) -> Misfit:
+    """The misfit of the sharpest of several tests, with the chance that one of them is as sharp."""
     test = sharper(*(one.test for one in found))
     return Misfit(min(found, key=lambda one: one.test.p_value).sigma if test.found else 0.0, test)
 
@@ -118,6 +122,11 @@ def _relative(tested: Weighed) -> _Relative:
 def _of_means(relative: _Relative, group: Int[np.ndarray, " n"], statistical: float, held_out: bool) -> Misfit:
     """Test the means of groups of pixels against chance; see ``misfit``."""
     mean, noise, _ = _means(relative, group, statistical, held_out)
+    return _in_sum(mean, noise)
+
+
+def _in_sum(mean: Float[np.ndarray, " groups"], noise: Float[np.ndarray, " groups"]) -> Misfit:
+    """The misfit of all groups' means together."""
     test = chi2_test(float(np.sum(mean**2 / noise)), float(len(mean)))
     return Misfit(excess_sigma(mean**2, noise, np.ones(len(mean)), float(len(mean))), test)
 
@@ -139,7 +148,7 @@ def _spots(pixels: Pixels, relative: _Relative, statistical: float, held_out: bo
 
     Returns the misfit, whose size is that of the parts which stand out, RMS over the sensor, and the most likely spot.
     """
-    found: list[tuple[MisfitTest, float, Spot]] = []
+    found: list[tuple[Misfit, Spot]] = []
     for down, across in _PARTS:
         mean, noise, part = _means(relative, tile_numbers(pixels.scaled, (down, across)), statistical, held_out)
         if not mean.size:
@@ -148,12 +157,8 @@ def _spots(pixels: Pixels, relative: _Relative, statistical: float, held_out: bo
         worst, out = int(np.argmax(z)), z > _OUT
         row, column = divmod(int(part[worst]), across)
         spot = Spot((column + 0.5) / across, (row + 0.5) / down, (1 / across, 1 / down), float(mean[worst]))
-        size = float(np.sqrt(np.sum(np.maximum(mean**2 - noise, 0.0)[out]) / mean.size))
-        some = excess_sigma(mean**2, noise, np.ones(mean.size), float(mean.size))
-        found.append((largest_test(z), max(size, some), spot))
-        found.append((chi2_test(float(z @ z), float(z.size)), max(size, some), spot))
+        size, together = float(np.sqrt(np.sum(np.maximum(mean**2 - noise, 0.0)[out]) / mean.size)), _in_sum(mean, noise)
+        found.append((Misfit(max(size, together.sigma), sharper(largest_test(z), together.test)), spot))
     if not found:
         return Misfit(0.0, NO_TEST), Spot(0.5, 0.5, (1.0, 1.0), 0.0)
-    _, size, spot = min(found, key=lambda one: one[0].p_value)
-    test = sharper(*(one[0] for one in found))
-    return Misfit(size if test.found else 0.0, test), spot
+    return _sharpest([each for each, _ in found]), min(found, key=lambda one: one[0].test.p_value)[1]
