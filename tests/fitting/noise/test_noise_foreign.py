@@ -258,19 +258,29 @@ def test_noise_in_proportion_to_the_signal_of_a_pixel_is_told(bent_DN: int) -> N
     assert not noted(measure(SENSOR, 3), "beside shot noise")
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_response_that_saturates_softly_is_told_where_it_begins_to(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "knee", "width", "told"),
+    [
+        (0, 0.6, 0.4, "Flats above 70 % of saturation do not follow the curve"),
+        (1, 0.6, 0.4, "Flats above 70 % of saturation do not follow the curve"),
+        (1, 0.62, 0.5, "All variances of flat 6"),
+    ],
+)
+def test_a_response_that_saturates_softly_is_told_where_it_begins_to(
+    seed: int, knee: float, width: float, told: str
+) -> None:
     """The bright flats were outliers, and K was up to 7 sigma too small by the next ones."""
 
     def soft(codes: np.ndarray, _: int) -> np.ndarray:
         part = (codes - 64) / 3600
-        return np.rint(64 + 3600 * np.where(part < 0.6, part, 0.6 + 0.4 * np.tanh((part - 0.6) / 0.4))).astype(int)
+        bent = np.where(part < knee, part, knee + width * np.tanh((part - knee) / width))
+        return np.rint(64 + 3600 * bent).astype(int)
 
     sensor = replace(SENSOR, levels=(0.05, 0.15, 0.25, 0.35, 0.45, 0.6, 0.75, 1.4), stack_level=0.63, stack_frames=24)
     data = captured(sensor, seed)
     result = fit_noise(changed(data, soft))
     # Flat 6, of three quarters of the well, is the only one that bends.
-    assert noted(result, "Flats above 70 % of saturation do not follow the curve")
+    assert noted(result, told)
     for name, truth in (("K_DN_per_e", 0.36), ("sigma_d_e", 4.0)):
         assert abs(z(result, name, truth)) < 3.0, name
     assert not noted(fit_noise(data), "do not follow")
