@@ -31,7 +31,8 @@ from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.posterior import TermAt, linear_cov
 from udccal.fitting.backscatter.read import read_backscatter
-from udccal.fitting.backscatter.solve import Problem, search
+from udccal.fitting.backscatter.search import search
+from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.forecast import PREDICTORS
 from udccal.planning.state import ModelErrors, measured_state, sensor_samples

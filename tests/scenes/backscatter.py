@@ -121,15 +121,31 @@ def measured(
     return Binned(*(part[None] for part in parts), np.array([exposure_s]), np.array([np.nan]))
 
 
+def codes_of(of: World, light: Float[np.ndarray, "256"]) -> Float[np.ndarray, "256"]:
+    """Codes at which the world's panel has this light, from 0 to 1, as another panel has it at each code."""
+    return 255 * light ** (1 / float(np.asarray(of.term.gamma)))
+
+
 def shots_of(
-    of: World, rng: np.random.Generator, pictures: list[np.ndarray], exposure_s: float = EXPOSURE_S
+    of: World,
+    rng: np.random.Generator,
+    pictures: list[np.ndarray],
+    exposure_s: float = EXPOSURE_S,
+    codes: Float[np.ndarray, "256"] | None = None,
+    leak: float = 0.0,
 ) -> BackscatterData:
-    """White, dark and pictures with noise."""
+    """White, dark and pictures with noise.
+
+    ``codes`` are those that the panel makes of the pictures' (``codes_of``). ``leak`` is a share of white that is in
+    all shots but dark, and grows across the sensor.
+    """
     crop = visible_crop(of.term.geometry, of.rig)
     panel = of.rig.panel
     white = np.full((panel.rows, panel.columns, 3), 255, np.uint8)
-    rates = clean_light(of, [white, *pictures])
-    shots = Binned.joined([measured(rate, rng, exposure_s) for rate in (*rates, np.zeros_like(rates[0]))])
+    rates = clean_light(of, [white, *(pictures if codes is None else [codes[one] for one in pictures])])
+    more = leak * np.median(rates[0], axis=(1, 2), keepdims=True) * np.linspace(0.7, 1.3, rates[0].shape[2])
+    light = *(rate + more for rate in rates), np.zeros_like(rates[0])
+    shots = Binned.joined([measured(rate, rng, exposure_s) for rate in light])
     shown = np.stack([crop.of(picture) for picture in pictures])
     return BackscatterData(shots, shown, crop, tuple(f"picture_{k}" for k in range(len(pictures))))
 

@@ -37,7 +37,8 @@ from udccal.fitting.backscatter.parameters import (
     prior_of,
 )
 from udccal.fitting.backscatter.posterior import TermAt, moments_along_reflection
-from udccal.fitting.backscatter.solve import Problem, search
+from udccal.fitting.backscatter.search import search
+from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64

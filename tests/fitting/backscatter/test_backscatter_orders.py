@@ -24,7 +24,8 @@ from udccal.fitting.backscatter.data import BackscatterData
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import KERNELS, MIX, REFLECTION, TWO_PLANES, Order, prior_of, values_of
 from udccal.fitting.backscatter.posterior import TermAt, linear_cov
-from udccal.fitting.backscatter.solve import Fitted, Problem, search
+from udccal.fitting.backscatter.search import search
+from udccal.fitting.backscatter.solve import Fitted, Problem
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Attempt, Choice
 from udccal.models.backscatter import Backscatter

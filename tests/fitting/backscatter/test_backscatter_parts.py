@@ -34,7 +34,8 @@ from udccal.fitting.backscatter.parameters import (
     with_linear,
 )
 from udccal.fitting.backscatter.read import visible_crop
-from udccal.fitting.backscatter.solve import Fitted, typical_error
+from udccal.fitting.backscatter.search import typical_error
+from udccal.fitting.backscatter.solve import Fitted
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import emitter_shares, panel_response, response_grid, window_corners
 from udccal.models.geometry import panel_directions

@@ -11,7 +11,8 @@ from scipy.special import expit
 from tests.scenes.backscatter import PICTURES, RULES, panel_pictures, shots_of, small_rig, world
 from udccal.fitting.backscatter.parameters import NAMES, REFLECTION, TWO_PLANES, MostProbable, most_probable, prior_of
 from udccal.fitting.backscatter.posterior import Moments, moments_along_reflection
-from udccal.fitting.backscatter.solve import Problem, held_out, search
+from udccal.fitting.backscatter.search import held_out, search
+from udccal.fitting.backscatter.solve import Problem
 from udccal.rig import load_rig
 
 PRIOR = prior_of(load_rig("lg55-reduced"))

@@ -7,6 +7,7 @@ from jaxtyping import Bool
 
 from udccal.arguments import check_kind
 from udccal.errors import FitError
+from udccal.fitting.backscatter.dark_frame import light_besides
 from udccal.fitting.backscatter.data import BackscatterData, Binned
 from udccal.fitting.backscatter.model import Usable, grid_step, window_for
 from udccal.fitting.backscatter.parameters import (
@@ -23,7 +24,8 @@ from udccal.fitting.backscatter.parameters import (
     values_of,
 )
 from udccal.fitting.backscatter.posterior import Misfits, TermAt, linear_cov, scaled, value_moments
-from udccal.fitting.backscatter.solve import BAD_BINS, BAD_PICTURES, Found, Problem, search
+from udccal.fitting.backscatter.search import BAD_BINS, BAD_PICTURES, Found, search
+from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.nominal import absent_backscatter
@@ -98,14 +100,14 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     values = value_moments(found, inflation)
     # A pattern has widened all parameters already.
     cov = scaled(values.cov, np.sqrt(np.maximum(misfits.wider / inflation, 1.0)))
-    cov += scaled(misfits.by_brightness, value_slope(fitted.found.x))
+    cov += scaled(misfits.by_panel, value_slope(fitted.found.x))
     # Pictures give lengths in panel pixels only: lengths change with the pitch.
     pitch, lengths = rig.panel.pitch_mm, np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]) * values.mean
     cov += (pitch.tolerance / pitch.value) ** 2 * np.outer(lengths, lengths)
     scale = np.where(np.arange(len(NAMES)) == PUPIL, 1 / footprint_per_pupil(rig), 1.0)
     cov = scaled(cov, scale)
-    by_brightness = scaled(misfits.by_brightness, linear_slope(fitted.found.x))
-    posterior = term_at.posterior(linear_cov(found, np.maximum(misfits.wider, inflation)) + by_brightness)
+    by_panel = scaled(misfits.by_panel, linear_slope(fitted.found.x))
+    posterior = term_at.posterior(linear_cov(found, np.maximum(misfits.wider, inflation)) + by_panel)
     nominal = values_of(problem.prior.mean)
     priors = priors_of(NAMES, nominal * scale, problem.prior.sigma * value_slope(nominal) * scale)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
@@ -175,12 +177,25 @@ def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
 
 def _notes(found: Found, misfits: Misfits, scatter: float, clipped: list[str]) -> tuple[str, ...]:
     notes = [f"{len(clipped)} clipped pictures left out."] if clipped else []
+    if found.without_dark:
+        red, green, blue = 100 * light_besides(found.problem, found.fitted.best)
+        notes.append(
+            f"White and pictures have light that the dark frame has not, {red:.2g}, {green:.2g} and {blue:.2g} % of "
+            "white in red, green and blue; the dark frame is left out. Keep all light out, and the panel's power on, "
+            "for every step."
+        )
     if found.model_error > 0:
         notes.append(f"Ratios to white are modelled to {found.model_error:.2%} only; that counts as noise.")
     if misfits.pattern.inflation > 1:
         notes.append(
             f"Residuals have a pattern (p = {misfits.pattern.p_value:.1g}); all sigmas are "
             f"{np.sqrt(misfits.pattern.inflation):.1f} times those of independent ones."
+        )
+    if (curve := misfits.curve).test.found:
+        notes.append(
+            f"The panel's light is no power of its codes (p = {curve.test.p_value:.1g}): at code {curve.code} it is "
+            f"{100 * curve.off:+.2g} % of that at 255 off. Sigmas include what that moves. Let the panel show the full "
+            "range of codes, without picture mode or raised black."
         )
     if misfits.brightness > 0:
         notes.append(
@@ -215,6 +230,7 @@ def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[
     return (
         *outliers(f"pictures with more than {found.problem.rules.most_clipped:.0%} of their bins clipped", clipped),
         *BAD_PICTURES.listed(name for name, one in zip(names, bad, strict=True) if one),
+        *outliers("dark frames of other light", ["dark"] if found.without_dark else []),
         *outliers("bins with clipped samples", named(~usable)),
         *BAD_BINS.listed(named(outlying & ~bad[:, None, None])),
     )

@@ -58,6 +58,8 @@ class BackscatterRules:
         undetermined: sigma of the footprints' places over the prior's, from which pictures hold too little information,
         known: unless sigma is below this: ln of distance and pupil, offsets in panel px.
         steady: variance between frames of a picture, over noise, from which the panel may flicker.
+        better_without_dark: model error without the dark frame over that with it, up to which a dark frame of other
+            light is left out.
         brightness: scatter of pictures' brightness, in model errors, beyond which the panel is told to differ.
         most_outliers: the largest fraction of pictures that may be outliers.
     """
@@ -75,6 +77,7 @@ class BackscatterRules:
     undetermined: float = 0.5
     known: tuple[float, float, float, float] = (0.1, 0.1, 0.5, 0.5)
     steady: float = 1.3
+    better_without_dark: float = 0.5
     brightness: float = 3.0
     most_outliers: float = 0.25
 

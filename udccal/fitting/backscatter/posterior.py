@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 
 from udccal.fitting.backscatter.data import BackscatterData, Profile
 from udccal.fitting.backscatter.model import Rays, grid_rays, ratios, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.panel_curve import PanelCurve
 from udccal.fitting.backscatter.parameters import (
     LOGARITHMIC,
     REFLECTION,
@@ -31,7 +32,7 @@ from udccal.fitting.backscatter.parameters import (
     values_of,
     with_linear,
 )
-from udccal.fitting.backscatter.solve import Found
+from udccal.fitting.backscatter.search import Found
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_sigma, f_tail, group_means_test, sharper
 from udccal.fitting.engine.orders import evidence
@@ -143,22 +144,26 @@ class Misfits:
     Attributes:
         pattern: test whether residuals of a shot and colour have the same sign over parts of the sensor or all of it.
         brightness, brightness_test: relative scatter of the shots' brightness, 0 where chance explains it; its test.
-        by_brightness: what that adds to the covariance of the solver's parameters.
+        curve: how the panel's light by code differs from a power.
+        by_panel: what brightness and curve add to the covariance of the solver's parameters.
         wider: factors of the parameters' variances, above 1 where parts of the sensor ask for different values.
     """
 
     pattern: MisfitTest
     brightness: float
     brightness_test: MisfitTest
-    by_brightness: Cov
+    curve: PanelCurve
+    by_panel: Cov
     wider: Vector
 
     @classmethod
     def of(cls, found: Found) -> Misfits:
         """Test the residuals of a fit."""
-        errors, jacobian = found.problem.errors_at(found.fitted.best.weight)(found.fitted.found.x)
-        sigma, test, cov, rest = _brightness(found, errors, jacobian)
-        return cls(_pattern(found), sigma, test, cov, _disagreement(found, rest, jacobian))
+        _, jacobian = found.problem.errors_at(found.fitted.best.weight)(found.fitted.found.x)
+        curve = PanelCurve.of(found.problem, found.fitted)
+        sigma, test, cov, rest = _brightness(found, curve.rest, jacobian)
+        wider = _disagreement(found, rest, jacobian)
+        return cls(_pattern(found), sigma, test, curve, curve.cov + cov, wider)
 
 
 def _pattern(found: Found) -> MisfitTest:
@@ -188,20 +193,17 @@ def _brightness(
     Returns:
         relative scatter, 0 where chance explains it; its test; what it adds to the covariance; errors without it.
     """
-    fitted, solved, free = found.fitted, found.fitted.found, found.fitted.order.free
+    fitted = found.fitted
     each = np.arange(len(fitted.ratio) - 1)
     moves = np.zeros((len(each), *fitted.ratio.shape))
     moves[each, each] = -fitted.ratio[:-1]
-    brighter = fitted.best.jacobian(moves).reshape(len(each), -1).T
-    shifts = -solved.cov[:, free] @ jacobian[:, free].T @ brighter
+    beside = fitted.beside_parameters(jacobian, moves)
     # What is left in the residuals, along directions that are independent of each other.
-    left = brighter + jacobian[:, free] @ shifts[free]
-    size, ways = np.linalg.eigh(brighter.T @ left)
-    ways, size = ways[:, size > 1e-6 * size.max()], size[size > 1e-6 * size.max()]
-    amount, dof = ways.T @ (brighter.T @ errors) / size, len(size)
-    rest = errors - left @ (ways @ amount)
+    size, ways = beside.ways()
+    amount, dof = ways.T @ (beside.whole.T @ errors) / size, len(size)
+    rest = errors - beside.left @ (ways @ amount)
     # Brightness is common to the colours: a kernel that is wrong leaves as much by colour as it seems to explain.
-    by_colour = brighter.reshape(*fitted.ratio.shape, -1)
+    by_colour = beside.whole.reshape(*fitted.ratio.shape, -1)
     along = np.einsum("scn,scnk->ck", rest.reshape(fitted.ratio.shape), by_colour) ** 2
     along /= np.maximum((by_colour**2).sum(axis=(0, 2)), 1e-300)
     scale = max(fitted.best.chi2 / found.dof, float(along.sum()) / max(along.size - dof, 1), 1.0)
@@ -210,8 +212,8 @@ def _brightness(
     sigma = excess_sigma(amount**2, scale / size, np.ones(dof), float(dof)) if dof > 2 and test.found else 0.0
     # A wrong kernel's errors are larger bin by bin than what a picture's bins have in common.
     if sigma <= found.problem.rules.brightness * found.model_error:
-        return 0.0, test, np.zeros_like(solved.cov), errors
-    return sigma, test, dof / (dof - 2) * sigma**2 * shifts @ shifts.T, rest
+        return 0.0, test, np.zeros_like(fitted.found.cov), errors
+    return sigma, test, dof / (dof - 2) * sigma**2 * beside.shifts @ beside.shifts.T, rest
 
 
 def _disagreement(found: Found, errors: Float[np.ndarray, " m"], jacobian: Float[np.ndarray, "m 18"]) -> Vector:
