@@ -22,7 +22,8 @@ class ToySensor:
 
     ``other_noise`` draws read noise of unit variance in place of Tukey's lambda; a fraction ``telegraph`` of the pixels
     has three times the read noise. ``pattern`` is a relative response in addition to the white one, ``dark_pattern``
-    the pixels' dark current over their mean. ``response`` maps a
+    the pixels' dark current over their mean. ``black_DN_per_s`` moves black with exposure, without noise; below 0 it
+    compensates dark current. ``response`` maps a
     linear signal to one that is seen, both over the full well, and takes the place of ``bend``.
     """
 
@@ -39,6 +40,7 @@ class ToySensor:
     dark_pattern: Float[np.ndarray, "rows columns"] | None = None
     row_DN: float = 0.4
     dark_e_per_s: float = 40.0
+    black_DN_per_s: float = 0.0
     DSNU_e: float = 3.0
     PRNU: float = 0.008
     bend: float = 0.02
@@ -99,7 +101,8 @@ def expose(
     draw = sensor.other_noise
     noise = draw(rng, shape) if draw else _read_noise(sensor.lambda_read, shape, rng)
     signal = bent + fixed.offset_e + fixed.read_e * noise
-    codes = sensor.black_DN + sensor.K_DN_per_e * signal + sensor.row_DN * rng.standard_normal((shape[0], 1))
+    black = sensor.black_DN + sensor.black_DN_per_s * exposure_s
+    codes = black + sensor.K_DN_per_e * signal + sensor.row_DN * rng.standard_normal((shape[0], 1))
     return np.clip(np.rint(codes), 0, 2**sensor.bits - 1).astype(np.uint16)
 
 

@@ -63,9 +63,17 @@ def draw(seed: int) -> Case:
         flux_e_per_s=5 * well,
         flicker=float(rng.choice([0.0, 0.0, rng.uniform(1e-3, 0.02)])),
     )
+    sensor = replace(sensor, black_DN_per_s=_moving_black(np.random.default_rng([seed, 27]), sensor))
     tails = f", {telegraph:.1%} telegraph" if telegraph else ""
-    what = f"{name}{tails}, {kind} gain, {bits} bit, K {K:.3g}, read {read:.2g} e, bend {sensor.bend:.2g}"
+    moves = f", black moves {sensor.black_DN_per_s:+.2g} DN/s" if sensor.black_DN_per_s else ""
+    what = f"{name}{tails}, {kind} gain, {bits} bit, K {K:.3g}, read {read:.2g} e, bend {sensor.bend:.2g}{moves}"
     return Case(what, functools.partial(answer, sensor, seed, _bounded(sensor)))
+
+
+def _moving_black(rng: np.random.Generator, sensor: ToySensor) -> float:
+    """In a twentieth each: a camera that compensates dark current, and one whose black rises by up to 100 e/s."""
+    kind, rise = int(rng.integers(20)), sensor.K_DN_per_e * float(np.exp(rng.uniform(np.log(3.0), np.log(100.0))))
+    return {0: -sensor.K_DN_per_e * sensor.dark_e_per_s, 1: rise}.get(kind, 0.0)
 
 
 def _read_noise(rng: np.random.Generator) -> tuple[str, Draw | None]:
@@ -107,6 +115,9 @@ def answer(sensor: ToySensor, seed: int, bounded: bool) -> Answer:
     fixed = patterns(sensor, np.random.default_rng([seed, 77]))
     read = float(np.sqrt(np.mean(fixed.read_e**2)))
     true = truth(replace(sensor, read_e=read)) | {"PRNU1288": float(np.std(fixed.response) / np.mean(fixed.response))}
+    if sensor.black_DN_per_s:
+        # A well that fills does so at another code in every exposure.
+        del true["saturation_DN"]
     least = _least(sensor) if bounded else {}
     stated = [one for one in result.estimates if one.name in true and (one.name != "lambda_read" or bounded)]
     return of_result(
@@ -121,7 +132,7 @@ def answer(sensor: ToySensor, seed: int, bounded: bool) -> Answer:
 
 def _bounded(sensor: ToySensor) -> bool:
     """Whether the bound holds: the likelihood is the model's, and light is as steady as the exposure times say."""
-    return sensor.other_noise is None and not sensor.telegraph and not sensor.flicker
+    return sensor.other_noise is None and not (sensor.telegraph or sensor.flicker or sensor.black_DN_per_s)
 
 
 def _least(sensor: ToySensor) -> dict[str, float]:

@@ -12,7 +12,7 @@ import pytest
 from tests.scenes.noise import PLAIN, ToySensor, errors_in_sigma, measure
 from udccal.errors import FitError
 from udccal.fitting.engine.orders import Quantity
-from udccal.fitting.noise.dark import unexplained_variance
+from udccal.fitting.noise.dark_noise import unexplained_variance
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, NoiseRules
 from udccal.fitting.noise.fit import fit_noise
 from udccal.fitting.noise.line_noise import LineNoise, column_noise

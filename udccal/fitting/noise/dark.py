@@ -6,19 +6,14 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
 
-from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.misfit import chi2_tail, excess_sigma, f_test
+from udccal.fitting.engine.misfit import excess_sigma, f_test
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.codes import LOW, DarkFit, Five, excess_kurtosis, fit_dark, pair_probability, row_gain
+from udccal.fitting.noise.dark_noise import PerPair, Two, dark_line, unexplained_variance
 from udccal.fitting.noise.line_noise import LineNoise, column_noise, row_noise
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Cov, DarkTerms, dsnu
-
-PerPair = Float[np.ndarray, " _"]
-# Of black and dark current.
-Two = Float[np.ndarray, "2"]
 
 
 def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, start: Five, curvature: float = 0.0) -> DarkTerms:
@@ -129,17 +124,6 @@ def _with_drawn_lines(fit: DarkFit, data: NoiseMoments, row_DN: float, rows: Lin
     return replace(fit, cov=cov)
 
 
-def _line(means: PerPair, variances: PerPair, times: PerPair) -> tuple[Two, Cov, PerPair]:
-    """Black and dark current in DN per s by a line through mean signals, their covariance, and what the line leaves.
-
-    One exposure time does not tell dark current from black: all is black.
-    """
-    design = np.column_stack([np.ones_like(times), times * bool(np.ptp(times) > 0)])
-    cov = scaled_inverse(design.T @ (design / variances[:, None]))
-    values = cov @ (design.T @ (means / variances))
-    return values, cov, means - design @ values
-
-
 def _with_means(data: NoiseMoments, found: _Codes) -> _Codes:
     """The fit with the mean signals of the pairs, and what mean codes say of them.
 
@@ -154,8 +138,8 @@ def _with_means(data: NoiseMoments, found: _Codes) -> _Codes:
     own = np.array([of.temporal_DN2 / (2 * of.pixels) + found.row_DN**2 / (2 * of.height) for of in dark])
     # Of equal weights: where the means do not lie on a line, others would make another one.
     weighed = own if found.white else fit.variances_DN2
-    by_codes, cov, _ = _line(codes, weighed, times)
-    doubt = by_codes - _line(fit.means_DN, weighed, times)[0]
+    by_codes, cov, _ = dark_line(codes, weighed, times)
+    doubt = by_codes - dark_line(fit.means_DN, weighed, times)[0]
     if not found.white or np.all(np.abs(doubt) <= data.rules.foreign_sigma * np.sqrt(np.diag(cov))):
         return replace(found, doubt=doubt)
     own += [of.outlier_variance_DN2 / (2 * of.pixels) for of in dark]
@@ -182,14 +166,14 @@ def _levels(
         own = (more[1] / stack.frames + _kept_rounding(data, more[1])) / stack.mean_DN.size
         variances = np.append(variances, own + codes.row_DN**2 / len(stack.mean_DN) / stack.frames)
     means = means + curvature * np.maximum(means - float(fit.values[0]), 0.0) ** 2
-    (black, rate), cov, left = _line(means, variances, times)
+    (black, rate), cov, left = dark_line(means, variances, times)
     apart, unsteady, drift = bool(np.ptp(times) > 0), 0.0, np.zeros(2)
     if codes.white:
         dof = float(len(times) - 1 - apart)
         unsteady = excess_sigma(left**2, variances, np.ones_like(means), dof)
         # A few exposures tell the scatter of black only roughly (Student's t).
         unsteady *= (dof / max(dof - 2, 1)) ** 0.5
-        (black, rate), cov, _ = _line(means, variances + unsteady**2, times)
+        (black, rate), cov, _ = dark_line(means, variances + unsteady**2, times)
         # The stack was taken at another time.
         pairs = np.s_[: len(data.darks)]
         drift = _drift(means[pairs], variances[pairs] + unsteady**2, times[pairs]) if unsteady else drift
@@ -218,7 +202,7 @@ def _drift(means: PerPair, variances: PerPair, times: PerPair) -> Two:
 
     Exposures that are taken in order are bent by whatever drifts meanwhile.
     """
-    line, _, left = _line(means, variances, times)
+    line, _, left = dark_line(means, variances, times)
     design = np.column_stack([np.ones_like(times), times, (times - times.min()) ** 2])
     bent = np.linalg.lstsq(design / np.sqrt(variances)[:, None], means / np.sqrt(variances))[0]
     off, rest = (float(np.sum(one**2 / variances)) for one in (left, means - design @ bent))
@@ -230,7 +214,7 @@ def _read_noise(data: NoiseMoments, codes: _Codes, K_DN_per_e: float) -> tuple[Q
     """The read noise's variance, and ``DarkTerms.foreign``."""
     fit, values, times = codes.fit, codes.fit.values, np.array([pair.exposure_s for pair in data.darks])
     read, variance = float(values[2]), float(fit.cov[2, 2])
-    rate = _line(fit.means_DN, fit.variances_DN2, times)[0][1] if codes.skewed else values[1]
+    rate = dark_line(fit.means_DN, fit.variances_DN2, times)[0][1] if codes.skewed else values[1]
     expected = read + data.rounding_DN2 + K_DN_per_e * np.maximum(rate * times, 0.0)
     if not codes.white:
         # That of the fitted distribution in each pair's codes, without row noise.
@@ -261,62 +245,3 @@ def _cut_off(data: NoiseMoments) -> float:
     """
     of_zero = [float(of.codes[0]) * of.level_DN**2 / float(of.codes.sum()) for of in data.dark_moments]
     return float(np.mean(of_zero))
-
-
-def unexplained_variance(
-    data: NoiseMoments, expected_DN2: PerPair, most_hits: float, columns: LineNoise, of_all: bool = False
-) -> Quantity:
-    """Temporal variance of dark samples, without row noise, less that expected in each pair.
-
-    It comes from the differences of the codes, and its sigma from their fourth moment and the draws of ``columns``.
-    Where few differences have most of it, too few of them are found more often than too many, and the fourth moment is
-    then small as well: the sigma is larger by three times the skewness of the mean. No pair has weight by its own
-    fourth moment, for the same reason.
-
-    Differences taken for hits count where they are more than ``most_hits`` of all: radiation does not hit so often, so
-    that they are tails of the noise, or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the
-    variance over all pixels). Pixels far from the others count only where ``of_all`` is True: hot ones have shot noise,
-    dead ones have none.
-    """
-    values, variances, thirds = _temporal(data, most_hits, columns, of_all)
-    weights = np.array([of.pixels for of in data.dark_moments]) / np.maximum(expected_DN2, data.rounding_DN2) ** 2
-    weights /= weights.sum()
-    variance = float(weights**2 @ variances)
-    skewness = float(weights**3 @ thirds) / variance**1.5
-    return Quantity(float(weights @ (values - expected_DN2)), variance * (1 + 3 * skewness) ** 2)
-
-
-def unlike_exposures(data: NoiseMoments, dark: DarkTerms) -> bool:
-    """Whether temporal noise rises with the mean of dark frames, as dark current's does, but not with exposure.
-
-    Then exposure times are those of other frames. Where black drifts, noise rises with neither.
-    """
-    values, variances, _ = _temporal(data, data.rules.most_hits, dark.columns, dark.skewed)
-    means, times = np.array([(pair.mean_DN, pair.exposure_s) for pair in data.darks]).T
-
-    def off(signal_DN: PerPair) -> float:
-        left = values - dark.K_DN_per_e * signal_DN
-        return float(np.sum((left - np.average(left, weights=1.0 / variances)) ** 2 / variances))
-
-    by_time = off(max(dark.dark_DN_per_s.value, 0.0) * times)
-    # A sensor that warms by a degree or two changes its dark current by a fraction.
-    most = 0.25 * off(np.zeros(len(times)))
-    beyond = chi2_tail(by_time, len(times) - 1) < data.rules.contradictory
-    return bool(beyond and by_time > most and off(means) < 0.1 * by_time)
-
-
-def _temporal(
-    data: NoiseMoments, most_hits: float, columns: LineNoise, of_all: bool
-) -> tuple[PerPair, PerPair, PerPair]:
-    """Temporal variance of each dark pair, its own variance, and its third moment."""
-    tails = sum(of.outliers for of in data.dark_moments) > most_hits * sum(of.pixels for of in data.dark_moments)
-    values, variances, thirds = [], [], []
-    for pair, of in zip(data.darks, data.dark_moments, strict=True):
-        values.append((of.temporal_DN2 if of_all else of.near_DN2) + tails * of.outlier_variance_DN2)
-        fourth, sixth = (
-            (np.sum(pair.counts * pair.differences_DN**power) + tails * of.outlier_powers[power // 2 - 1]) / of.pixels
-            for power in (4, 6)
-        )
-        variances.append(max(fourth / 4 - values[-1] ** 2, values[-1] ** 2) / of.pixels + columns.drawn_DN4(1))
-        thirds.append(sixth / 8 / of.pixels**2)
-    return np.array(values), np.maximum(variances, 1e-30), np.array(thirds)

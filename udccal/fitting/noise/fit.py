@@ -15,7 +15,8 @@ from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.noise.codes import Five, start_values
 from udccal.fitting.noise.contradictions import contradiction
-from udccal.fitting.noise.dark import fit_dark_terms, unlike_exposures
+from udccal.fitting.noise.dark import fit_dark_terms
+from udccal.fitting.noise.dark_noise import unlike_exposures, with_own_noise
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, fit_curve, shared_by_neighbours
 from udccal.fitting.noise.frame_moments import bins, stacked
@@ -98,6 +99,8 @@ def fit_moments(data: NoiseMoments, nominal: Noise) -> FitResult[Noise]:
             break
         dark = fit_dark_terms(data, K, dark.fit.values, c)
         curve = fit_curve(data, dark)
+    if (own := with_own_noise(data, dark)) is not dark:
+        dark, curve = own, fit_curve(data, own)
     refused = _no_gain(data, dark, curve)
     return FitResult.failed("noise", nominal, *refused) if refused else _assembled(data, dark, curve)
 
@@ -161,10 +164,10 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> Patter
     K, V0, c, *_, gain_noise2, d = curve.values.tolist()
     bright, stack, rate = data.flat_stack, data.dark_stack, dark.dark_DN_per_s.value
     quiet = max(V0, 0.0) + data.rounding_DN2
-    at_no_light = (quiet + K * rate * bright.exposure_s) / bright.frames
+    at_no_light = (quiet + dark.shot_DN2(K, bright.exposure_s)) / bright.frames
     if dark.white:
         signal = bright.mean_DN.astype(np.float32) - stack.mean_DN.astype(np.float32)
-        at_no_light += (quiet + K * rate * stack.exposure_s) / stack.frames
+        at_no_light += (quiet + dark.shot_DN2(K, stack.exposure_s)) / stack.frames
     else:
         # Dark codes that are cut off or coarse do not show the offsets: the offsets' variance is subtracted instead.
         signal = bright.mean_DN.astype(np.float32) - np.float32(dark.black_DN + rate * bright.exposure_s)
@@ -262,4 +265,8 @@ def _values(
     jacobian[7, [0, 6]] = -rate / K**2, 1 / K
     jacobian[8, [0, 9]] = -spread / K**2, by_spread / K
     jacobian[10, [2, 3, 5, 7]] = full_DN, full_DN**2, -steeper, steeper
-    return values, jacobian @ inner @ jacobian.T
+    cov = jacobian @ inner @ jacobian.T
+    if dark.own_shot_DN2_per_s:
+        # The term has the mean's dark current; the noise's may be the sensor's.
+        cov[7, 7] += (rate / K - dark.own_shot_DN2_per_s.value / K**2) ** 2
+    return values, cov

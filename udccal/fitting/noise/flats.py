@@ -200,9 +200,11 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
 def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     """V0 from the histograms, and from the temporal variance of the dark stack where its frames were seen."""
     rounding, K, rate, read = data.rounding_DN2, dark.K_DN_per_e, dark.dark_DN_per_s.value, dark.read_DN2
-    drift = rate * np.array([pair.exposure_s for pair in data.darks])
+    times = np.array([pair.exposure_s for pair in data.darks])
+    # Where noise by exposure is known by itself, it does not change with the gain.
+    drift = 0 * times if dark.own_shot_DN2_per_s else rate * times
     # Dark signal in the pairs as their read noise depends on it: long exposures are noisier and count less.
-    total = read.value + dark.row_DN2.value + rounding + K * drift
+    total = read.value + dark.row_DN2.value + rounding + np.array([dark.shot_DN2(K, t) for t in times])
     points = [(read.value, read.variance**0.5, float(np.average(drift, weights=1 / total**2)))]
     seen = data.dark_seen
     # Hits were left out of the stack: where tails of the noise were taken for hits, it shows too little.
@@ -213,8 +215,8 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
         tails = excess_kurtosis(dark.shape.value) * min(read.value, variance) ** 2 * (1 - 1 / seen.frames)
         drawn = dark.columns.drawn_DN4(seen.frames - 1)
         sigma = float(np.sqrt((2 * variance**2 + tails) / float(seen.dof.sum()) + drawn))
-        signal = rate * seen.exposure_s
-        points.append((variance - rounding - K * signal, sigma, signal))
+        signal = 0.0 if dark.own_shot_DN2_per_s else rate * seen.exposure_s
+        points.append((variance - rounding - dark.shot_DN2(K, seen.exposure_s), sigma, signal))
     values, sigmas, drifts = np.array(points).T
     # An error of black acts on the curve as an error of V0 that is K times as large.
     shifted = K * np.sqrt(float(dark.levels_cov[0, 0]))

@@ -121,6 +121,14 @@ def _of_darks(data: NoiseMoments, dark: DarkTerms) -> Iterator[str]:
     if dark.columns.DN2.there:
         found = f"Columns share noise of {dark.columns.DN2.value**0.5:.2g} DN that changes from frame to frame"
         yield f"{found}: it is a part of sigma_d, and the noise term takes it for noise of single pixels."
+    if own := dark.own_shot_DN2_per_s:
+        K = dark.K_DN_per_e
+        found = f"The noise of dark frames grows as that of {own.value / K**2:.3g} e/s, their mean by"
+        yield (
+            f"{found} {dark.dark_DN_per_s.value / K:.3g} e/s: the camera compensates dark current, or its black "
+            "changes with exposure. sigma_d is by the noise; the term has the mean's dark current, whose sigma holds "
+            "both."
+        )
     if dark.drift_DN_per_s:
         found = f"Means of dark frames bend over exposures, by {dark.drift_DN_per_s / dark.K_DN_per_e:.2g} e/s"
         yield f"{found}: dark current or black drifted. Take dark frames once they are stable, or in random order."

@@ -100,7 +100,8 @@ class DarkTerms:
     ``foreign``: no distribution of the family describes the read noise; its variance is that of the codes. ``skewed``:
     none describes the mean code; black and dark current are those of the mean of all pixels. Black differs from
     exposure to exposure by ``unsteady_DN``, where that is more than noise. Where that is a curve over exposures, dark
-    current differs by ``drift_DN_per_s`` at the shortest.
+    current differs by ``drift_DN_per_s`` at the shortest. ``own_shot_DN2_per_s`` is by how much the variance of dark
+    frames grows with exposure, where that is not the shot noise of the dark current that their mean tells.
     """
 
     K_DN_per_e: float
@@ -120,6 +121,12 @@ class DarkTerms:
     skewed: bool
     fit: DarkFit
     offsets: Pattern
+    own_shot_DN2_per_s: Quantity | None = None
+
+    def shot_DN2(self, K_DN_per_e: float, exposure_s: float) -> float:
+        """Variance of dark current's shot noise at this gain."""
+        mean = K_DN_per_e * max(self.dark_DN_per_s.value, 0.0)
+        return (self.own_shot_DN2_per_s.value if self.own_shot_DN2_per_s else mean) * exposure_s
 
     @property
     def row_DN2(self) -> Quantity:
