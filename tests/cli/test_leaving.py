@@ -15,6 +15,7 @@ import pytest
 
 from tests.ctrl_c import heeding_ctrl_c
 from tests.toy_rigs import write_toy_rig
+from udccal.cli import main as main_module
 from udccal.errors import UdccalError
 from udccal.io.out_folder import check_writable
 from udccal.io.png import write_png16
@@ -68,6 +69,22 @@ def test_ctrl_c_while_the_command_starts_is_met_with_a_sentence(wait_s: float) -
     assert status in (1, 130)  # on a quick machine the place is refused before
     assert err.startswith("udccal: ")
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(("verb", "kept"), [("calibrate", True), ("run", False), ("fit", False)])
+def test_only_a_capture_is_said_to_keep_its_steps(
+    verb: str, kept: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(given: list[str]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(main_module, "_run", interrupt)
+    with pytest.raises(SystemExit) as left:
+        main_module.main(["--json", verb])
+    shown = capsys.readouterr()
+    assert left.value.code == 130
+    assert ("completed steps of a session are kept" in shown.err) is kept
+    assert "Run the same command again" in shown.err
 
 
 @pytest.mark.parametrize(

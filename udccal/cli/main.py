@@ -15,6 +15,8 @@ _FAILED, _WORDS, _BUG = 1, 2, 70
 # The statuses that a shell gives to programs which ended by SIGINT and by SIGPIPE.
 _STOPPED, _PIPE_CLOSED = 130, 141
 _CONTINUE = "Stopped. Run the same command again to continue; completed steps of a session are kept."
+_BEGIN = "Stopped. Run the same command again to begin anew."
+_CAPTURING = ("calibrate", "check", "demo", "simulate")
 _REPORT = "Something unexpected went wrong ({}). Run the same command with --debug and report what it prints."
 
 
@@ -46,18 +48,24 @@ def main(arguments: list[str] | None = None) -> None:
         found = f"Expected to read or write {place}, found: {error.strerror or error}."
         _fail(f"{found} Correct that place, or give another.", _FAILED, given)
     except KeyboardInterrupt:
-        _fail(_CONTINUE, _STOPPED, given)
+        _fail(_stopped(given), _STOPPED, given)
     except SystemExit as left:  # typer turns Ctrl-C and a closed pipe into this, without a word
         if left.code == _WORDS and left.__context__ is not None:
             _answer_error(_sentence_of(left.__context__), given)
         if left.code == _STOPPED:
-            _fail(_CONTINUE, _STOPPED, given)
+            _fail(_stopped(given), _STOPPED, given)
         if isinstance(left.__context__, BrokenPipeError):
             _leave_the_rest()
             sys.exit(_PIPE_CLOSED)
         raise
     except Exception as error:
         _fail(_REPORT.format(type(error).__name__), _BUG, given)
+
+
+def _stopped(given: list[str]) -> str:
+    """What to do after an interrupt: the first word that is no flag is the verb."""
+    verb = next((word for word in given if not word.startswith("-")), "")
+    return _CONTINUE if verb in _CAPTURING else _BEGIN
 
 
 def _run(given: list[str]) -> None:

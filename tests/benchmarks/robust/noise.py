@@ -71,9 +71,13 @@ def draw(seed: int) -> Case:
 
 
 def _moving_black(rng: np.random.Generator, sensor: ToySensor) -> float:
-    """In a twentieth each: a camera that compensates dark current, and one whose black rises by up to 100 e/s."""
-    kind, rise = int(rng.integers(20)), sensor.K_DN_per_e * float(np.exp(rng.uniform(np.log(3.0), np.log(100.0))))
-    return {0: -sensor.K_DN_per_e * sensor.dark_e_per_s, 1: rise}.get(kind, 0.0)
+    """In a twentieth each: a camera that compensates dark current, and one whose black rises.
+
+    It rises as by a dark current whose noise would show: of 0.15 to 3 times the read noise's variance in a second.
+    """
+    kind, part = int(rng.integers(20)), float(np.exp(rng.uniform(np.log(0.15), np.log(3.0))))
+    rise_e = {0: -sensor.dark_e_per_s, 1: 3.0 + part * sensor.read_e**2}.get(kind, 0.0)
+    return sensor.K_DN_per_e * rise_e
 
 
 def _read_noise(rng: np.random.Generator) -> tuple[str, Draw | None]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.misfit import chi2_tail
+from udccal.fitting.engine.misfit import chi2_tail, chi2_test
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.line_noise import LineNoise
 from udccal.fitting.noise.moments import NoiseMoments
@@ -61,7 +61,9 @@ def with_own_noise(data: NoiseMoments, dark: DarkTerms) -> DarkTerms:
     Cameras that compensate dark current keep the mean and not its noise; others raise black with exposure, which makes
     none (EMVA 1288, release 4.0, clause 7.1, takes dark current from the noise of cameras that compensate it).
     """
-    values, variances, _ = _temporal(data, data.rules.most_hits, dark.columns, dark.skewed)
+    # What was taken for hits were tails of a noise that no distribution describes.
+    most_hits = 0.0 if dark.foreign else data.rules.most_hits
+    values, variances, _ = _temporal(data, most_hits, dark.columns, dark.skewed)
     times, rate = np.array([pair.exposure_s for pair in data.darks]), dark.dark_DN_per_s
     if not dark.white or len(np.unique(times)) < 3:
         return dark
@@ -69,8 +71,7 @@ def with_own_noise(data: NoiseMoments, dark: DarkTerms) -> DarkTerms:
     cov *= max(float(np.sum(left**2 / variances)) / (len(times) - 2), 1.0)
     expected = dark.K_DN_per_e * max(rate.value, 0.0)
     off, off_2 = slope - expected, float(cov[1, 1]) + dark.K_DN_per_e**2 * float(dark.levels_cov[1, 1])
-    by_chance = chi2_tail(off**2 / off_2, 1.0) >= data.rules.contradictory
-    if by_chance or abs(off) < _EXPLAINED * max(slope, expected):
+    if not chi2_test(off**2 / off_2, 1.0).found or abs(off) < _EXPLAINED * max(slope, expected):
         return dark
     # The codes' distribution was fitted with another shot noise, which its shape has followed.
     shape = replace(dark.shape, variance=max(dark.shape.variance, data.rules.shape_sigma**2))

@@ -173,6 +173,10 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
         # What was taken for hits were tails of the noise.
         variance = variance + np.array([[of.outlier_variance_DN2] for of in flats])
     above, K, q = mean - dark.black_DN, dark.K_DN_per_e, data.q_DN
+    if dark.own_shot_DN2_per_s:
+        # The curve knows only the shot noise of what the mean shows.
+        shown = K * max(dark.dark_DN_per_s.value, 0.0)
+        variance = variance - np.array([[dark.shot_DN2(K, of.exposure_s) - shown * of.exposure_s] for of in flats])
     variance = steadied(flats, variance, above)
     # Bins keep 5 sigma of their noise and 2.5 of their shading away from the range's ends.
     temporal, uneven = 5.0 * np.sqrt(variance), np.sqrt(np.maximum(spread**2 - variance, 0.0))
