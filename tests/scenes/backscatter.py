@@ -133,16 +133,18 @@ def shots_of(
     exposure_s: float = EXPOSURE_S,
     codes: Float[np.ndarray, "256"] | None = None,
     leak: float = 0.0,
+    brightness: float = 1.0,
 ) -> BackscatterData:
     """White, dark and pictures with noise.
 
     ``codes`` are those that the panel makes of the pictures' (``codes_of``). ``leak`` is a share of white that is in
-    all shots but dark, and grows across the sensor.
+    all shots but dark, and grows across the sensor. White is shown at ``brightness`` times that of the pictures.
     """
     crop = visible_crop(of.term.geometry, of.rig)
     panel = of.rig.panel
     white = np.full((panel.rows, panel.columns, 3), 255, np.uint8)
     rates = clean_light(of, [white, *(pictures if codes is None else [codes[one] for one in pictures])])
+    rates[0] = brightness * rates[0]
     more = leak * np.median(rates[0], axis=(1, 2), keepdims=True) * np.linspace(0.7, 1.3, rates[0].shape[2])
     light = *(rate + more for rate in rates), np.zeros_like(rates[0])
     shots = Binned.joined([measured(rate, rng, exposure_s) for rate in light])

@@ -43,21 +43,30 @@ def draw(seed: int) -> Case:
 @final
 @dataclass(frozen=True)
 class Light:
-    """What a panel does besides a power of its codes: a share of white that leaks, and the name of another curve."""
+    """What a panel does besides a power of its codes.
+
+    Attributes:
+        leak: share of white that is in all shots but dark.
+        curve: name of another curve, or nothing.
+        white: brightness of white over that of the pictures.
+    """
 
     leak: float
     curve: str
+    white: float
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Light:
-        """A leak in a sixth of the panels, another curve in a sixth."""
-        kind, leak = rng.integers(6), float(np.exp(rng.uniform(np.log(3e-4), np.log(0.05))))
-        return cls(leak if kind == 0 else 0.0, str(rng.choice(list(_CURVES))) if kind == 1 else "")
+        """A leak, another curve or a limiter of power, in an eighth of the panels each."""
+        kind, leak = rng.integers(8), float(np.exp(rng.uniform(np.log(3e-4), np.log(0.05))))
+        curve, white = str(rng.choice(list(_CURVES))), float(rng.uniform(0.5, 0.97))
+        return cls(leak * (kind == 0), curve * int(kind == 1), white if kind == 2 else 1.0)
 
     @property
     def what(self) -> str:
         """In words."""
-        return (f", {self.leak:.2%} leak" if self.leak else "") + (f", curve {self.curve}" if self.curve else "")
+        limited = f", white of {self.white:.0%}" if self.white != 1 else ""
+        return (f", {self.leak:.2%} leak" if self.leak else "") + f", curve {self.curve}" * bool(self.curve) + limited
 
 
 @in_float64
@@ -68,7 +77,7 @@ def answer(seed: int, order: Order, white: float, pictures: int, exposure_s: flo
     shown = panel_pictures(of.rig, 100 * seed, pictures + 1)
     share = np.arange(256) / 255
     codes = codes_of(of, _CURVES[light.curve](share) / _CURVES[light.curve](share)[-1]) if light.curve else 255 * share
-    data = shots_of(of, rng, shown[1:], exposure_s, codes, light.leak)
+    data = shots_of(of, rng, shown[1:], exposure_s, codes, light.leak, light.white)
     result = fit_backscatter(data, of.term.geometry, of.rig, RULES)
     if not result.ok:
         return of_result(result, ())

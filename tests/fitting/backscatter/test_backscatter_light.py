@@ -70,3 +70,24 @@ def test_a_panel_of_another_curve_is_told_and_new_pictures_are_within_their_sigm
     found = predicted_light(curve.term, curve, model_error, RIG, pictures[:2], PLACES)
     true = predicted_light(of.term, curve, 0.0, RIG, [other[one] for one in pictures[:2]], PLACES)
     assert np.abs((found.rate - true.rate) / found.sigma).max() < 4.5
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("white", [0.95, 0.6])
+def test_a_panel_that_limits_its_power_is_told_and_moves_nothing(white: float) -> None:
+    """A white of 70 % left new pictures off by 5 % of white, POOR_FIT."""
+    of, pictures = world(np.random.default_rng(78), RIG, KERNELS[1]), panel_pictures(RIG, 300, 11)
+    whole, limited = (
+        fit_backscatter(
+            shots_of(of, np.random.default_rng(7), pictures[2:], brightness=brightness), of.term.geometry, RIG, RULES
+        )
+        for brightness in (1.0, white)
+    )
+    assert not _told(whole, "of the brightness that the pictures predict")
+    assert _told(limited, f"White has {100 * white:.3g} % of the brightness that the pictures predict")
+    for name in ("gamma", "standoff_mm", "mix_rg"):
+        before, after = whole.estimate(name), limited.estimate(name)
+        assert abs(after.value - before.value) < 3 * np.hypot(before.sigma, after.sigma)
+    found, true = (predicted_light(one, limited, 0.0, RIG, pictures[:2], PLACES) for one in (limited.term, of.term))
+    assert np.abs((found.rate - true.rate) / found.sigma).max() < 4.5
+    assert np.abs(found.rate - true.rate).max() < 1e-3 * np.asarray(of.term.mask).max()

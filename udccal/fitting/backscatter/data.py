@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import final
 
 import numpy as np
@@ -57,6 +57,14 @@ class Binned:
     def part(self, which: slice | Shaped[np.ndarray, " n"]) -> Binned:
         """Return some of the shots."""
         return Binned(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def with_white(self, brightness: float) -> Binned:
+        """Return the shots with white's light over this number, and its noise."""
+        rate, shot, rest = self.rate.copy(), self.shot.copy(), self.rest.copy()
+        dark = self.exposure_s[-1] / self.exposure_s[0] * self.rate[-1]
+        rate[0] = (self.rate[0] - dark) / brightness + dark
+        shot[0], rest[0] = shot[0] / brightness, rest[0] / brightness**2
+        return replace(self, rate=rate, shot=shot, rest=rest)
 
     def at(self, flat: Int[np.ndarray, " n"]) -> Binned:
         """Return all shots at some bins, by their flat indices."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool
 
 from udccal.arguments import check_kind
 from udccal.errors import FitError
-from udccal.fitting.backscatter.dark_frame import light_besides
 from udccal.fitting.backscatter.data import BackscatterData, Binned
 from udccal.fitting.backscatter.model import Usable, grid_step, window_for
 from udccal.fitting.backscatter.parameters import (
@@ -26,6 +27,7 @@ from udccal.fitting.backscatter.parameters import (
 from udccal.fitting.backscatter.posterior import Misfits, TermAt, linear_cov, scaled, value_moments
 from udccal.fitting.backscatter.search import BAD_BINS, BAD_PICTURES, Found, search
 from udccal.fitting.backscatter.solve import Problem
+from udccal.fitting.backscatter.unlike_shots import light_besides
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.nominal import absent_backscatter
@@ -62,16 +64,17 @@ def fit_backscatter(
         FitError: when the data's grid is not that of the rig's sensor.
     """
     check_kind(data, BackscatterData, "Give the binned rates as one.", FitError)
-    rules, step, found = rules or BackscatterRules(), grid_step(rig), data.shots.rate.shape
+    rules, step, grid = rules or BackscatterRules(), grid_step(rig), data.shots.rate.shape
     shape = rig.camera.rows // step, rig.camera.columns // step
-    if found[0] and found[2:] != shape:
-        raise FitError(f"Expected a grid of {shape} bins for this sensor, found {found[2:]}. Bin all of the sensor.")
+    if grid[0] and grid[2:] != shape:
+        raise FitError(f"Expected a grid of {shape} bins for this sensor, found {grid[2:]}. Bin all of the sensor.")
     keep = data.shots.clipped.mean(axis=(1, 2, 3))[1:-1] <= rules.most_clipped
     if (unusable := _unusable(data.shots, keep, rules)) is not None:
         return FitResult.failed("backscatter", absent_backscatter(rig, geometry), *unusable)
     clipped = [name for name, kept in zip(data.names, keep, strict=True) if not kept]
     used = data.only(keep)
-    return result_of(search(Problem.of(used, geometry, rig, rules)), used, rig, clipped)
+    found = search(Problem.of(used, geometry, rig, rules))
+    return result_of(found, replace(used, shots=used.shots.with_white(found.problem.white)), rig, clipped)
 
 
 def _unusable(
@@ -183,6 +186,12 @@ def _notes(found: Found, misfits: Misfits, scatter: float, clipped: list[str]) -
             f"White and pictures have light that the dark frame has not, {red:.2g}, {green:.2g} and {blue:.2g} % of "
             "white in red, green and blue; the dark frame is left out. Keep all light out, and the panel's power on, "
             "for every step."
+        )
+    if (white := found.problem.white) != 1:
+        notes.append(
+            f"White has {100 * white:.3g} % of the brightness that the pictures predict, and counts at theirs: the "
+            "panel limits its power, or bends near white. Lower its brightness, or switch the limiter off; else "
+            "restoring takes too much off under bright pictures."
         )
     if found.model_error > 0:
         notes.append(f"Ratios to white are modelled to {found.model_error:.2%} only; that counts as noise.")

@@ -58,8 +58,9 @@ class BackscatterRules:
         undetermined: sigma of the footprints' places over the prior's, from which pictures hold too little information,
         known: unless sigma is below this: ln of distance and pupil, offsets in panel px.
         steady: variance between frames of a picture, over noise, from which the panel may flicker.
-        better_without_dark: model error without the dark frame over that with it, up to which a dark frame of other
-            light is left out.
+        better_without: model error without the dark frame, or white, over that with it, up to which its light counts
+            as other than that of the rest.
+        unlike_white: white's brightness differs from the pictures' by more than this; less is scatter.
         brightness: scatter of pictures' brightness, in model errors, beyond which the panel is told to differ.
         most_outliers: the largest fraction of pictures that may be outliers.
     """
@@ -77,7 +78,8 @@ class BackscatterRules:
     undetermined: float = 0.5
     known: tuple[float, float, float, float] = (0.1, 0.1, 0.5, 0.5)
     steady: float = 1.3
-    better_without_dark: float = 0.5
+    better_without: float = 0.5
+    unlike_white: float = 0.01
     brightness: float = 3.0
     most_outliers: float = 0.25
 

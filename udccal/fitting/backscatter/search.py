@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Int
 from scipy.special import ndtri
 
-from udccal.fitting.backscatter.dark_frame import dark_frame_test
 from udccal.fitting.backscatter.data import Binned, Profile
 from udccal.fitting.backscatter.model import Usable
 from udccal.fitting.backscatter.panel_curve import PanelCurve
@@ -31,6 +30,7 @@ from udccal.fitting.backscatter.parameters import (
     values_of,
 )
 from udccal.fitting.backscatter.solve import Fitted, Problem
+from udccal.fitting.backscatter.unlike_shots import DARK, WHITE, brightness_of_white, unlike_test
 from udccal.fitting.engine.misfit import chi2_test, excess_sigma, robust_excess_sigma
 from udccal.fitting.engine.orders import Attempt, Choice, choose, evidence
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
@@ -80,21 +80,39 @@ class Found:
 
 def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
     """Fit the orders and choose the one of largest evidence; ``kernels`` has one item if the order is known."""
-    rules, usable = problem.rules, problem.seen.usable
-    simple, rich, error = _richest(problem, usable)
-    if dark_frame_test(problem, rich).found:
-        # The dark signal of each bin then comes from the pictures, which differ in their light there.
-        usable[-1] = False
-        without = _richest(problem, usable)
-        # A panel of another curve has more light at dark codes, too, and is still found without the dark frame.
-        if without[-1] <= rules.better_without_dark * error and not PanelCurve.of(problem, without[1]).test.found:
-            simple, rich, error = without
+    problem, simple, rich, error = _agreeing(problem)
     usable = rich.best.weight > 0
-    orders = _compared(problem, rich, simple.found.x, kernels if error <= rules.nothing_fits else (TWO_PLANES,))
+    kernels = kernels if error <= problem.rules.nothing_fits else (TWO_PLANES,)
+    orders = _compared(problem, rich, simple.found.x, kernels)
     fitted, error = refit(problem, orders.best.fit, usable)
     held, new = held_out(problem, fitted)
     # Held-out pictures show the error to expect of new ones.
     return Found(problem, fitted, max(error, new), orders, held)
+
+
+def _agreeing(problem: Problem) -> tuple[Problem, Fitted, Fitted, float]:
+    """Fit one plane and two; leave the dark frame out, or scale white, where the other shots agree better then.
+
+    Without the dark frame, pictures tell the dark level of each bin, as they differ in their light there.
+    """
+    simple, rich, error = _richest(problem, problem.seen.usable)
+    for shot in (DARK, WHITE):
+        if not unlike_test(problem, rich, shot).found:
+            continue
+        usable = problem.seen.usable
+        usable[shot] = False
+        without = _richest(problem, usable)
+        if without[-1] > problem.rules.better_without * error:
+            continue
+        # A panel of another curve has other light at dark codes, and is still found without the dark frame.
+        if shot == DARK and not PanelCurve.of(problem, without[1]).test.found:
+            return problem, *without
+        brightness = brightness_of_white(problem, without[1].best)
+        if shot == WHITE and abs(brightness - 1) > problem.rules.unlike_white:
+            # White stays in, at the pictures' brightness: it has light in bins where no picture has any.
+            problem = problem.with_white(brightness)
+            return problem, *_richest(problem, problem.seen.usable)
+    return problem, simple, rich, error
 
 
 def _richest(problem: Problem, usable: Usable) -> tuple[Fitted, Fitted, float]:

@@ -136,7 +136,10 @@ class Fitted:
 @final
 @dataclass(frozen=True)
 class Problem:
-    """The common part of all orders; ``flat`` are the positions' grid indices, ``rays`` are in panel coordinates."""
+    """The common part of all orders; ``flat`` are the positions' grid indices, ``rays`` are in panel coordinates.
+
+    White was seen at ``white`` times the brightness of the pictures, and ``seen`` has it at theirs.
+    """
 
     template: Backscatter
     seen: Binned
@@ -146,6 +149,7 @@ class Problem:
     prior: Prior
     start: Vector
     rules: BackscatterRules
+    white: float = 1.0
 
     @classmethod
     def of(
@@ -171,6 +175,10 @@ class Problem:
         across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in prior.sigma[OFFSET])
         start[OFFSET] = min(((x, y) for y in down for x in across), key=cost)
         return cls(template, seen, shown, rays, flat, prior, start, rules)
+
+    def with_white(self, brightness: float) -> Problem:
+        """Return the problem with white at the pictures' brightness, of which it had this part."""
+        return replace(self, seen=self.seen.with_white(brightness), white=self.white * brightness)
 
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
         """Solve for the most probable parameters of an order at given weights, from ``x`` on."""
