@@ -122,3 +122,26 @@ def test_noise_far_below_a_code_is_fitted_though_dark_current_has_more() -> None
     steady = ExposureLevel(1e-4, tuple(np.full_like(frame, 64) for frame in shortest.dark))
     result = fit_noise(replace(data, levels=[steady, *data.levels]))
     assert result.ok
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.2])
+def test_a_gain_that_differs_over_the_sensor_is_named(strength: float) -> None:
+    """A camera that corrects its lens's shading multiplies codes, and their noise, by more towards the corners."""
+    sensor = replace(PLAIN, rows=256, columns=320)
+    v, u = np.mgrid[-1:1:256j, -1:1:320j]
+    gain = 1 + strength * (u**2 + v**2)
+
+    def corrected(frames: tuple[np.ndarray, ...] | list[np.ndarray]) -> tuple[np.ndarray, ...]:
+        black = sensor.black_DN
+        return tuple(np.clip(np.rint(black + gain * (one - black)), 0, 4095).astype(np.uint16) for one in frames)
+
+    data = captured(sensor, 2)
+    levels = [replace(one, bright=corrected(one.bright), dark=corrected(one.dark)) for one in data.levels]
+    stack = replace(data.stack, bright=corrected(data.stack.bright), dark=corrected(data.stack.dark))
+    result = fit_noise(replace(data, levels=levels, stack=stack))
+    told = [note for note in result.notes if "from place to place on the sensor" in note]
+    assert len(told) == (strength > 0)
+    for note in told:
+        assert float(note.split("K differs by ")[1].split(" %")[0]) == pytest.approx(
+            100 * gain.std() / gain.mean(), rel=0.25
+        )

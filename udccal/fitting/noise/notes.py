@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
+from udccal.fitting.engine.misfit import f_test
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.noise.codes import converter_step
 from udccal.fitting.noise.flats import Curve
@@ -73,6 +74,9 @@ def notes(
         found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
         yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
         yield _PRNU_BY_CURVE
+        if (by_place := _gain_by_place(curve)) > 0:
+            cause = "as where the camera corrects its lens's shading: switch that off"
+            yield f"K differs by {100 * by_place:.2g} % from place to place on the sensor, {cause}."
     if curve.fit.order.gain_noise:
         found = f"Pixels have noise of {100 * curve.values[5] ** 0.5:.2g} % of their signal beside shot noise"
         cause = "from the pixels' gain or a lamp whose pattern changes"
@@ -105,6 +109,18 @@ def notes(
     if curve.fit.order.unsteady:
         found = f"The light differs by {100 * curve.fit.scatter:.2g} % from level to level"
         yield f"{found}{', or the response bends otherwise and K is off' * curve.fit.order.cubic}."
+
+
+def _gain_by_place(curve: Curve) -> float:
+    """Relative scatter of the gain over the sensor; 0 where its parts do not explain most of the misfit."""
+    use, z, dof = curve.levels.usable, np.nan_to_num(curve.fit.variance_z), np.maximum(curve.levels.dof, 1.0)
+    weight = use * dof / 2
+    parts = weight.sum(axis=0) > 0
+    # Of parts that are off by the same fraction at all levels; shot noise is most of the variance of flats.
+    off = (z * np.sqrt(weight)).sum(axis=0)[parts] / weight.sum(axis=0)[parts]
+    explained, levels = float(np.sum(off**2 * weight.sum(axis=0)[parts])), use.sum() / max(parts.sum(), 1)
+    found = f_test(explained / max(curve.fit.misfit.ratio, 1e-9), int(parts.sum()), float(use.sum())).found
+    return float(off.std()) if levels > 2 and found and explained > 0.5 * float(np.sum(z[use] ** 2)) else 0.0
 
 
 def _of_darks(data: NoiseMoments, dark: DarkTerms) -> Iterator[str]:
