@@ -17,8 +17,8 @@ from udccal.fitting.noise.patterns import Cov, DarkTerms
 PerPair = Float[np.ndarray, " _"]
 # Of black and dark current, or of noise without and by exposure.
 Two = Float[np.ndarray, "2"]
-# Of the noise's slope with exposure that a gain wrong by some per cent, or pixels with more dark current, may explain.
-_EXPLAINED = 0.1
+# Of the noise's slope with exposure: so much, pixels with more dark current than others may explain.
+_EXPLAINED = 0.03
 
 
 def dark_line(means: PerPair, variances: PerPair, times: PerPair) -> tuple[Two, Cov, PerPair]:
@@ -55,8 +55,10 @@ def unexplained_variance(
     return Quantity(float(weights @ (values - expected_DN2)), variance * (1 + 3 * skewness) ** 2)
 
 
-def with_own_noise(data: NoiseMoments, dark: DarkTerms) -> DarkTerms:
+def with_own_noise(data: NoiseMoments, dark: DarkTerms, K_sigma: float) -> DarkTerms:
     """Read noise from the noise of dark frames by exposure alone, where their mean tells another dark current.
+
+    ``K_sigma`` is that of the gain, in DN per electron.
 
     Cameras that compensate dark current keep the mean and not its noise; others raise black with exposure, which makes
     none (EMVA 1288, release 4.0, clause 7.1, takes dark current from the noise of cameras that compensate it).
@@ -70,7 +72,8 @@ def with_own_noise(data: NoiseMoments, dark: DarkTerms) -> DarkTerms:
     (read, slope), cov, left = dark_line(values, variances, times)
     cov *= max(float(np.sum(left**2 / variances)) / (len(times) - 2), 1.0)
     expected = dark.K_DN_per_e * max(rate.value, 0.0)
-    off, off_2 = slope - expected, float(cov[1, 1]) + dark.K_DN_per_e**2 * float(dark.levels_cov[1, 1])
+    by_gain2 = (K_sigma * rate.value) ** 2
+    off, off_2 = slope - expected, float(cov[1, 1]) + dark.K_DN_per_e**2 * float(dark.levels_cov[1, 1]) + by_gain2
     if not chi2_test(off**2 / off_2, 1.0).found or abs(off) < _EXPLAINED * max(slope, expected):
         return dark
     # The codes' distribution was fitted with another shot noise, which its shape has followed.
