@@ -11,6 +11,7 @@ from tests.profiles.conftest import fitted
 from tests.scenes.backscatter import World, panel_pictures, shots_of, small_rig, world
 from tests.validation.judged import failed, named
 from udccal.fitting.backscatter.data import BackscatterData
+from udccal.result import Diagnostic
 from udccal.validation.backscatter import judge_backscatter
 from udccal.validation.limits import ValidationLimits
 
@@ -39,6 +40,14 @@ def test_a_panel_at_90_percent_fails(true: World, data: BackscatterData) -> None
     assert "panel's brightness" in failed(found)
     assert named(found, "pattern over the sensor").value == 0.0
     assert named(found, "panel's brightness").value == pytest.approx(10.0, abs=0.5)
+
+
+def test_white_that_the_panel_dims_is_predicted_by_a_profile_that_knows(true: World) -> None:
+    dimmed = shots_of(true, np.random.default_rng(3), panel_pictures(true.rig, 0, 3), brightness=0.7)
+    unaware = fitted("backscatter", true.term)
+    aware = replace(unaware, diagnostics=(*unaware.diagnostics, Diagnostic("brightness_of_white", 0.7, "1")))
+    assert failed(judge_backscatter(dimmed, unaware, ValidationLimits()))
+    assert not failed(judge_backscatter(dimmed, aware, ValidationLimits()))
 
 
 def test_a_camera_elsewhere_on_the_panel_fails(true: World, data: BackscatterData) -> None:

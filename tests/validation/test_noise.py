@@ -36,6 +36,15 @@ def test_another_days_frames_are_predicted(result: FitResult[Noise], later: Nois
     assert 0.8 < float(np.nanstd(found.z_map.z)) < 1.2
 
 
+def test_another_days_frames_of_a_response_that_is_no_parabola_are_predicted() -> None:
+    sensor = ToySensor(bend=0.0, response=lambda x: x * (1 - 0.05 * x**2))
+    own = measure(sensor, 1)
+    assert own.diagnostic("curvature_growth")
+    assert not failed(judge_noise(captured(sensor, 2), own, ValidationLimits()))
+    parabola = replace(own, diagnostics=())
+    assert "pattern of variances" in failed(judge_noise(captured(sensor, 2), parabola, ValidationLimits()))
+
+
 @pytest.mark.parametrize(
     ("changes", "check"),
     [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, final
 
 import numpy as np
@@ -150,7 +150,7 @@ def _level(profile: Profile, session: Session, cause: Explained) -> Float[np.nda
     data = read_backscatter(session, profile.noise.term, term.geometry, shading)
     if (why := unusable_pictures(data, term)) is not None:
         raise SessionError(f"Expected panel pictures that can be compared, found: {why}")
-    return brightness(SeenLight.of(data, term, profile.backscatter.diagnostic("model_error_of_white") or 0.0))
+    return brightness(SeenLight.of(data, replace(profile.backscatter, term=term)))
 
 
 def _answer(profile: Profile, changes: Sequence[Change], solved: Solved, limits: DriftLimits) -> RigCheck:

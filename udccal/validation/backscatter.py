@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -23,6 +23,8 @@ from udccal.validation.patterns import Samples, bands, pattern_check
 
 # Every so many bins of the term's grid, down and across, are predicted.
 _EVERY = 4
+# No panel dims white to less of its brightness.
+_DIMMEST = 0.01
 
 
 def validate_backscatter(profile: Profile, session: Session, limits: ValidationLimits) -> Judged:
@@ -42,7 +44,7 @@ def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], lim
     """Judge the panel's brightness, the light of its pictures, patterns in it, and the scatter of the bins."""
     if (why := unusable_pictures(data, result.term)) is not None:
         return unusable("backscatter", why)
-    seen = SeenLight.of(data, result.term, result.diagnostic("model_error_of_white") or 0.0)
+    seen = SeenLight.of(data, result)
     worst = int(np.argmax(np.abs(seen.z).mean(axis=(1, 2))))
     count = int(seen.usable.sum())
     checks = (
@@ -95,8 +97,13 @@ class SeenLight:
     shape: tuple[int, int]
 
     @classmethod
-    def of(cls, data: BackscatterData, term: Backscatter, model_error: float) -> SeenLight:
-        """From all bins of a session, and a profile's term."""
+    def of(cls, data: BackscatterData, result: FitResult[Backscatter]) -> SeenLight:
+        """From all bins of a session, and a profile's fit."""
+        term, model_error = result.term, result.diagnostic("model_error_of_white") or 0.0
+        white = result.diagnostic("brightness_of_white") or 1.0
+        if white >= _DIMMEST:
+            # The panel limits its power: the mask is white at the pictures' brightness.
+            data = replace(data, shots=data.shots.with_white(white))
         rows, columns = data.shots.rate.shape[2:]
         down, across = np.arange(0, rows, _EVERY), np.arange(0, columns, _EVERY)
         flat = (down[:, None] * columns + across).ravel()

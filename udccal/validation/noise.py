@@ -16,8 +16,8 @@ from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.noise.data import NoiseData, NoiseRules, read_noise
 from udccal.fitting.noise.frame_moments import Moments, stacked
 from udccal.fitting.noise.moments import NoiseMoments, reduced
-from udccal.fitting.noise.response import temporal_variance
-from udccal.models.noise import Noise, linear_signal
+from udccal.fitting.noise.response import linear_mean, temporal_variance
+from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult
 from udccal.sessions.store import Session
@@ -31,6 +31,8 @@ from udccal.validation.prediction import Prediction
 _NAMES, _STEP = ("K_DN_per_e", "black_DN", "sigma_d_e", "sigma_row_DN", "nonlinearity"), 1e-4
 # Bins are predicted up to this part of saturation, and these sigmas of noise and of shading away from its ends.
 _UP_TO, _NOISE, _SHADING = 0.9, 5.0, 2.5
+# Of full scale, the cubic part of a response at most.
+_MOST_CUBIC = 0.5
 
 
 def validate_noise(profile: Profile, session: Session, limits: ValidationLimits) -> Judged:
@@ -86,7 +88,10 @@ def judge_noise(data: NoiseData, result: FitResult[Noise], limits: ValidationLim
 @final
 @dataclass(frozen=True)
 class _Transfer:
-    """The flats' bins, and the profile's numbers in the order of ``_NAMES``; ``cov`` is theirs."""
+    """The flats' bins, and the profile's numbers in the order of ``_NAMES``; ``cov`` is theirs.
+
+    ``cubic`` is what a response that is no parabola has beside the curvature, in 1/DN^2.
+    """
 
     mean: Float[np.ndarray, "flats bins"]
     variance: Float[np.ndarray, "flats bins"]
@@ -95,6 +100,7 @@ class _Transfer:
     rounding: float
     values: Float[np.ndarray, "5"]
     cov: Float[np.ndarray, "5 5"]
+    cubic: float
 
     @classmethod
     def of(cls, result: FitResult[Noise], seen: NoiseMoments) -> _Transfer:
@@ -107,14 +113,21 @@ class _Transfer:
         quiet = values[0] ** 2 * max((values[0] * values[2]) ** 2 - values[3] ** 2, 0.0)
         dof = stacked(flats, "dof")
         dof = dof / (1 + 0.5 * dof * quiet / samples / np.maximum(variance, 1e-9) ** 2)
-        return cls(mean, variance, dof, _inside(flats, term), rounding, values, cov)
+        span = float(np.asarray(term.saturation_DN)) - float(np.asarray(term.black_DN))
+        # The term's parabola meets such a response at full scale.
+        cubic = float(
+            np.clip(result.diagnostic("curvature_growth") or 0.0, -_MOST_CUBIC / span**2, _MOST_CUBIC / span**2)
+        )
+        values[4] -= cubic * span
+        return cls(mean, variance, dof, _inside(flats, term), rounding, values, cov, cubic)
 
     def predicted(self, values: Float[np.ndarray, "5"]) -> Float[np.ndarray, " n"]:
         """Variance of the usable bins in DN^2."""
         K, black, sigma_d, row, curvature = values
-        signal = linear_signal(self.mean[self.usable] - black, curvature, K)
+        above = self.mean[self.usable] - black
+        signal = linear_mean(above, *(np.full_like(above, one) for one in (curvature, self.cubic, K)))
         floor = (K * sigma_d) ** 2 - row**2
-        return np.asarray(temporal_variance(signal, K, floor, curvature, self.rounding))
+        return np.asarray(temporal_variance(signal, K, floor, curvature, self.rounding, cubic=self.cubic))
 
     def prediction(self) -> Prediction:
         """Errors of the variances, and the share of the profile's own error."""
