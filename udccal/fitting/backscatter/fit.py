@@ -127,7 +127,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
         candidates=found.orders.candidates,
         diagnostics=(
             Diagnostic("held_out_without_noise_of_peak", found.held_out, "1"),
-            Diagnostic("model_error_of_white", found.model_error, "1"),
+            Diagnostic("model_error_of_white", float(np.hypot(found.model_error, misfits.curve.rms)), "1"),
             Diagnostic("brightness_of_white", found.problem.white, "1"),
             Diagnostic("pattern_p_value", misfits.pattern.p_value, "1"),
             Diagnostic("pattern_inflation", inflation, "1"),

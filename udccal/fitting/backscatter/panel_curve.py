@@ -31,6 +31,7 @@ class PanelCurve:
     Attributes:
         test: of all codes together.
         code, off: where it differs most, and by how much there, as a share of the light at code 255; 0 unless found.
+        rms: of the difference over the codes, which is the error to expect of a new picture.
         cov: what that adds to the covariance of the solver's parameters.
         rest: whitened errors without what it explains.
     """
@@ -38,6 +39,7 @@ class PanelCurve:
     test: MisfitTest
     code: int
     off: float
+    rms: float
     cov: Cov
     rest: Float[np.ndarray, " m"]
 
@@ -49,11 +51,12 @@ class PanelCurve:
         found, dof = beside.explained(errors, _BESIDE_GAMMA), fitted.dof(problem.prior)
         test = f_test(found.chi2 / max(fitted.best.chi2 / dof, 1.0), found.rank, dof)
         if not test.found:
-            return cls(test, 0, 0.0, np.zeros_like(fitted.found.cov), errors)
+            return cls(test, 0, 0.0, 0.0, np.zeros_like(fitted.found.cov), errors)
         off, shifts = found.by_way.sum(axis=1), beside.shifts @ found.by_way
         most = int(np.abs(off).argmax())
         # Shifts that cancel here may not do so for other pictures.
-        return cls(test, int(_CODES[most]), float(off[most]), shifts @ shifts.T, errors + beside.left @ off)
+        size = float(off[most]), float(np.sqrt(np.mean(off**2)))
+        return cls(test, int(_CODES[most]), *size, shifts @ shifts.T, errors + beside.left @ off)
 
 
 def curve_moves(problem: Problem, fitted: Fitted) -> Moves:
