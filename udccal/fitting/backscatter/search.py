@@ -107,11 +107,11 @@ def _agreeing(problem: Problem) -> tuple[Problem, Fitted, Fitted, float]:
         # A panel of another curve has other light at dark codes, and is still found without the dark frame.
         if shot == DARK and not PanelCurve.of(problem, without[1]).test.found:
             return problem, *without
-        brightness = brightness_of_white(problem, without[1].best)
-        if shot == WHITE and abs(brightness - 1) > problem.rules.unlike_white:
+        if shot == WHITE:
             # White stays in, at the pictures' brightness: it has light in bins where no picture has any.
-            problem = problem.with_white(brightness)
-            return problem, *_richest(problem, problem.seen.usable)
+            scaled = problem.with_white(brightness_of_white(problem, without[1].best))
+            if abs(scaled.white - 1) > problem.rules.unlike_white:
+                return scaled, *_richest(scaled, scaled.seen.usable)
     return problem, simple, rich, error
 
 
