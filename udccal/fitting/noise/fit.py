@@ -99,9 +99,10 @@ def fit_moments(data: NoiseMoments, nominal: Noise) -> FitResult[Noise]:
             break
         dark = fit_dark_terms(data, K, dark.fit.values, c)
         curve = fit_curve(data, dark)
-    if (own := with_own_noise(data, dark, float(curve.cov[0, 0]) ** 0.5)) is not dark:
-        dark, curve = own, fit_curve(data, own)
     refused = _no_gain(data, dark, curve)
+    if not refused and (own := with_own_noise(data, dark, float(curve.cov[0, 0]) ** 0.5)) is not dark:
+        dark, curve = own, fit_curve(data, own)
+        refused = _no_gain(data, dark, curve)
     return FitResult.failed("noise", nominal, *refused) if refused else _assembled(data, dark, curve)
 
 
