@@ -81,7 +81,7 @@ def answer(seed: int, order: Order, white: float, pictures: int, exposure_s: flo
     result = fit_backscatter(data, of.term.geometry, of.rig, RULES)
     if not result.ok:
         return of_result(result, ())
-    model_error = next((one.value for one in result.diagnostics if one.name == "model_error_of_white"), 0.0)
+    model_error = result.diagnostic("model_error_of_white") or 0.0
     found = predicted_light(result.term, result, model_error, of.rig, shown[:1], _PLACES)
     true = predicted_light(of.term, result, 0.0, of.rig, [codes[shown[0]]], _PLACES).rate
     parts = zip(found.rate.ravel() - true.ravel(), found.sigma.ravel(), strict=True)

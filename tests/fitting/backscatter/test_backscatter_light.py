@@ -66,8 +66,9 @@ def test_a_panel_of_another_curve_is_told_and_new_pictures_are_within_their_sigm
     # The curve has more light at dark codes, or less; that is no leak.
     assert not _told(curve, "dark frame")
     assert curve.estimate("gamma").sigma > 5 * power.estimate("gamma").sigma
-    model_error = next(one.value for one in curve.diagnostics if one.name == "model_error_of_white")
-    found = predicted_light(curve.term, curve, model_error, RIG, pictures[:2], PLACES)
+    found = predicted_light(
+        curve.term, curve, curve.diagnostic("model_error_of_white") or 0.0, RIG, pictures[:2], PLACES
+    )
     true = predicted_light(of.term, curve, 0.0, RIG, [other[one] for one in pictures[:2]], PLACES)
     assert np.abs((found.rate - true.rate) / found.sigma).max() < 4.5
 

@@ -60,9 +60,8 @@ class Binned:
 
     def with_white(self, brightness: float) -> Binned:
         """Return the shots with white's light over this number, and its noise."""
-        rate, shot, rest = self.rate.copy(), self.shot.copy(), self.rest.copy()
-        dark = self.exposure_s[-1] / self.exposure_s[0] * self.rate[-1]
-        rate[0] = (self.rate[0] - dark) / brightness + dark
+        rate, shot, rest, light = self.rate.copy(), self.shot.copy(), self.rest.copy(), self.excess[0]
+        rate[0] += light / brightness - light
         shot[0], rest[0] = shot[0] / brightness, rest[0] / brightness**2
         return replace(self, rate=rate, shot=shot, rest=rest)
 

@@ -11,6 +11,7 @@ from udccal.arguments import check_kind
 from udccal.errors import FitError
 from udccal.fitting.backscatter.data import BackscatterData, Binned
 from udccal.fitting.backscatter.model import Usable, grid_step, window_for
+from udccal.fitting.backscatter.other_light import light_besides
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
     DISTANCE,
@@ -27,7 +28,6 @@ from udccal.fitting.backscatter.parameters import (
 from udccal.fitting.backscatter.posterior import Misfits, TermAt, linear_cov, scaled, value_moments
 from udccal.fitting.backscatter.search import BAD_BINS, BAD_PICTURES, Found, search
 from udccal.fitting.backscatter.solve import Problem
-from udccal.fitting.backscatter.unlike_shots import light_besides
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.nominal import absent_backscatter

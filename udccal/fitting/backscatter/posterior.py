@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from udccal.fitting.backscatter.data import BackscatterData, Profile
 from udccal.fitting.backscatter.model import Rays, grid_rays, ratios, ratios_and_jacobian, window_for
-from udccal.fitting.backscatter.panel_curve import PanelCurve
+from udccal.fitting.backscatter.other_light import Beside, PanelCurve
 from udccal.fitting.backscatter.parameters import (
     LOGARITHMIC,
     REFLECTION,
@@ -159,8 +159,8 @@ class Misfits:
     @classmethod
     def of(cls, found: Found) -> Misfits:
         """Test the residuals of a fit."""
-        _, jacobian = found.problem.errors_at(found.fitted.best.weight)(found.fitted.found.x)
-        curve = PanelCurve.of(found.problem, found.fitted)
+        errors, jacobian = found.problem.linearised(found.fitted)
+        curve = PanelCurve.of(found.problem, found.fitted, errors, jacobian)
         sigma, test, cov, rest = _brightness(found, curve.rest, jacobian)
         wider = _disagreement(found, rest, jacobian)
         return cls(_pattern(found), sigma, test, curve, curve.cov + cov, wider)
@@ -197,11 +197,9 @@ def _brightness(
     each = np.arange(len(fitted.ratio) - 1)
     moves = np.zeros((len(each), *fitted.ratio.shape))
     moves[each, each] = -fitted.ratio[:-1]
-    beside = fitted.beside_parameters(jacobian, moves)
-    # What is left in the residuals, along directions that are independent of each other.
-    size, ways = beside.ways()
-    amount, dof = ways.T @ (beside.whole.T @ errors) / size, len(size)
-    rest = errors - beside.left @ (ways @ amount)
+    beside = Beside.of(fitted, jacobian, moves)
+    amount, size, dof = beside.amounts(errors), beside.size, len(beside.size)
+    rest = errors + beside.left @ (beside.ways @ amount)
     # Brightness is common to the colours: a kernel that is wrong leaves as much by colour as it seems to explain.
     by_colour = beside.whole.reshape(*fitted.ratio.shape, -1)
     along = np.einsum("scn,scnk->ck", rest.reshape(fitted.ratio.shape), by_colour) ** 2

@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from udccal.fitting.backscatter.data import Binned, Profile
 from udccal.fitting.backscatter.model import Usable
-from udccal.fitting.backscatter.panel_curve import PanelCurve
+from udccal.fitting.backscatter.other_light import DARK, WHITE, PanelCurve, brightness_of_white, unlike_test
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
     DISTANCE,
@@ -30,7 +30,6 @@ from udccal.fitting.backscatter.parameters import (
     values_of,
 )
 from udccal.fitting.backscatter.solve import Fitted, Problem
-from udccal.fitting.backscatter.unlike_shots import DARK, WHITE, brightness_of_white, unlike_test
 from udccal.fitting.engine.misfit import chi2_test, excess_sigma, robust_excess_sigma
 from udccal.fitting.engine.orders import Attempt, Choice, choose, evidence
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
@@ -69,7 +68,7 @@ class Found:
     @property
     def without_dark(self) -> bool:
         """Whether the dark frame was left out, because it has other light than the rest."""
-        return not bool((self.fitted.best.weight[-1] > 0).any())
+        return not self.good[DARK]
 
     @property
     def places(self) -> Int[np.ndarray, "n 2"]:
@@ -96,20 +95,22 @@ def _agreeing(problem: Problem) -> tuple[Problem, Fitted, Fitted, float]:
     Without the dark frame, pictures tell the dark level of each bin, as they differ in their light there.
     """
     simple, rich, error = _richest(problem, problem.seen.usable)
+    errors, jacobian = problem.linearised(rich)
     for shot in (DARK, WHITE):
-        if not unlike_test(problem, rich, shot).found:
+        if not unlike_test(problem, rich, errors, jacobian, shot).found:
             continue
         usable = problem.seen.usable
         usable[shot] = False
         without = _richest(problem, usable)
         if without[-1] > problem.rules.better_without * error:
             continue
+        fitted = without[1]
         # A panel of another curve has other light at dark codes, and is still found without the dark frame.
-        if shot == DARK and not PanelCurve.of(problem, without[1]).test.found:
+        if shot == DARK and not PanelCurve.of(problem, fitted, *problem.linearised(fitted)).test.found:
             return problem, *without
         if shot == WHITE:
             # White stays in, at the pictures' brightness: it has light in bins where no picture has any.
-            scaled = problem.with_white(brightness_of_white(problem, without[1].best))
+            scaled = problem.with_white(brightness_of_white(problem, fitted.best))
             if abs(scaled.white - 1) > problem.rules.unlike_white:
                 return scaled, *_richest(scaled, scaled.seen.usable)
     return problem, simple, rich, error

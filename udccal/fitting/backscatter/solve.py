@@ -36,55 +36,12 @@ from udccal.fitting.backscatter.parameters import (
     prior_of,
 )
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.rig import RigDescription
 
-BAD_PICTURES = OutlierRule("pictures in brightness or pattern")
-BAD_BINS = OutlierRule("bins")
 PerSample = Float[np.ndarray, " k"]
-
-
-@final
-@dataclass(frozen=True)
-class Explained:
-    """Independent amounts of changes that fit errors best, each in its way, and by how much chi-squared falls."""
-
-    by_way: Float[np.ndarray, "k rank"]
-    chi2: float
-
-    @property
-    def rank(self) -> int:
-        """Number of ways."""
-        return self.by_way.shape[1]
-
-
-@final
-@dataclass(frozen=True)
-class Beside:
-    """Changes that no parameter describes: errors by each, the parameters' shifts by it, and errors left after them."""
-
-    whole: Float[np.ndarray, "m k"]
-    shifts: Float[np.ndarray, "18 k"]
-    left: Float[np.ndarray, "m k"]
-
-    def ways(self, least: float = 1e-6) -> tuple[Float[np.ndarray, " rank"], Float[np.ndarray, "k rank"]]:
-        """Return combinations of changes whose errors are independent of each other, and their sums of squares.
-
-        Combinations that the parameters can follow are left out: ``least`` of the largest sum of squares, and less.
-        """
-        size, ways = np.linalg.eigh(self.whole.T @ self.left)
-        kept = size > least * size.max()
-        return size[kept], ways[:, kept]
-
-    def explained(self, errors: Float[np.ndarray, " m"], least: float = 1e-6) -> Explained:
-        """Return what the changes explain of errors, if the parameters follow; ``least`` is that of ``ways``."""
-        size, ways = self.ways(least)
-        along = ways.T @ (self.whole.T @ errors)
-        # Errors are those at no change: they vanish where the change's own are their opposite.
-        return Explained(-ways * (along / size), float((along**2 / size).sum()))
 
 
 @final
@@ -124,13 +81,6 @@ class Fitted:
         # A dark frame that is left out has no sample for its dark signal.
         per_bin = 1 + ~(self.best.weight[-1] > 0)
         return max(float(used.sum() - (used.any(axis=0) * per_bin).sum() - np.maximum(1.0 - narrowed, 0.0).sum()), 1.0)
-
-    def beside_parameters(self, jacobian: Float[np.ndarray, "m 18"], of_ratio: Moves) -> Beside:
-        """Return what changes of the ratios do to whitened errors beside the parameters, which follow them."""
-        free = self.order.free
-        whole = self.best.jacobian(of_ratio).reshape(len(of_ratio), -1).T
-        shifts = -self.found.cov[:, free] @ jacobian[:, free].T @ whole
-        return Beside(whole, shifts, whole + jacobian[:, free] @ shifts[free])
 
 
 @final
@@ -191,6 +141,10 @@ class Problem:
         """Return light over that of white, and its derivatives by the solver's coordinates."""
         ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), self.rays, self.shown)
         return ratio, jacobian * linear_slope(x)[:, None, None, None]
+
+    def linearised(self, fitted: Fitted) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
+        """Return a fit's whitened errors and their Jacobian."""
+        return self.errors_at(fitted.best.weight)(fitted.found.x)
 
     def errors_at(self, weight: PerShot) -> ErrorsAt:
         """Return a function for whitened errors, with the best mask and dark, and their Jacobian."""
