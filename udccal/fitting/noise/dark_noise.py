@@ -63,17 +63,17 @@ def with_own_noise(data: NoiseMoments, dark: DarkTerms, K_sigma: float) -> DarkT
     Cameras that compensate dark current keep the mean and not its noise; others raise black with exposure, which makes
     none (EMVA 1288, release 4.0, clause 7.1, takes dark current from the noise of cameras that compensate it).
     """
+    times = np.array([pair.exposure_s for pair in data.darks])
+    if not dark.white or len(np.unique(times)) < 3:
+        return dark
     # What was taken for hits were tails of a noise that no distribution describes.
     most_hits = 0.0 if dark.foreign else data.rules.most_hits
     values, variances, _ = _temporal(data, most_hits, dark.columns, dark.skewed)
-    times, rate = np.array([pair.exposure_s for pair in data.darks]), dark.dark_DN_per_s
-    if not dark.white or len(np.unique(times)) < 3:
-        return dark
     (read, slope), cov, left = dark_line(values, variances, times)
     cov *= max(float(np.sum(left**2 / variances)) / (len(times) - 2), 1.0)
-    expected = dark.K_DN_per_e * max(rate.value, 0.0)
-    by_gain2 = (K_sigma * rate.value) ** 2
-    off, off_2 = slope - expected, float(cov[1, 1]) + dark.K_DN_per_e**2 * float(dark.levels_cov[1, 1]) + by_gain2
+    expected = dark.shot_DN2(dark.K_DN_per_e, 1.0)
+    by_gain2, by_mean2 = (K_sigma / dark.K_DN_per_e * expected) ** 2, dark.K_DN_per_e**2 * float(dark.levels_cov[1, 1])
+    off, off_2 = slope - expected, float(cov[1, 1]) + by_gain2 + by_mean2
     if not chi2_test(off**2 / off_2, 1.0).found or abs(off) < _EXPLAINED * max(slope, expected):
         return dark
     # The codes' distribution was fitted with another shot noise, which its shape has followed.

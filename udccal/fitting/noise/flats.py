@@ -175,8 +175,8 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     above, K, q = mean - dark.black_DN, dark.K_DN_per_e, data.q_DN
     if dark.own_shot_DN2_per_s:
         # The curve knows only the shot noise of what the mean shows.
-        shown = K * max(dark.dark_DN_per_s.value, 0.0)
-        variance = variance - np.array([[dark.shot_DN2(K, of.exposure_s) - shown * of.exposure_s] for of in flats])
+        exposure_s = np.array([[of.exposure_s] for of in flats])
+        variance = variance - (dark.own_shot_DN2_per_s.value - K * dark.dark_DN_per_s.value) * exposure_s
     variance = steadied(flats, variance, above)
     # Bins keep 5 sigma of their noise and 2.5 of their shading away from the range's ends.
     temporal, uneven = 5.0 * np.sqrt(variance), np.sqrt(np.maximum(spread**2 - variance, 0.0))
@@ -206,9 +206,10 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     rounding, K, rate, read = data.rounding_DN2, dark.K_DN_per_e, dark.dark_DN_per_s.value, dark.read_DN2
     times = np.array([pair.exposure_s for pair in data.darks])
     # Where noise by exposure is known by itself, it does not change with the gain.
-    drift = 0 * times if dark.own_shot_DN2_per_s else rate * times
+    by_gain = 0.0 if dark.own_shot_DN2_per_s else rate
+    drift = by_gain * times
     # Dark signal in the pairs as their read noise depends on it: long exposures are noisier and count less.
-    total = read.value + dark.row_DN2.value + rounding + np.array([dark.shot_DN2(K, t) for t in times])
+    total = read.value + dark.row_DN2.value + rounding + dark.shot_DN2(K, 1.0) * times
     points = [(read.value, read.variance**0.5, float(np.average(drift, weights=1 / total**2)))]
     seen = data.dark_seen
     # Hits were left out of the stack: where tails of the noise were taken for hits, it shows too little.
@@ -219,7 +220,7 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
         tails = excess_kurtosis(dark.shape.value) * min(read.value, variance) ** 2 * (1 - 1 / seen.frames)
         drawn = dark.columns.drawn_DN4(seen.frames - 1)
         sigma = float(np.sqrt((2 * variance**2 + tails) / float(seen.dof.sum()) + drawn))
-        signal = 0.0 if dark.own_shot_DN2_per_s else rate * seen.exposure_s
+        signal = by_gain * seen.exposure_s
         points.append((variance - rounding - dark.shot_DN2(K, seen.exposure_s), sigma, signal))
     values, sigmas, drifts = np.array(points).T
     # An error of black acts on the curve as an error of V0 that is K times as large.

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from udccal.fitting.engine.misfit import f_test
+from udccal.fitting.engine.misfit import group_means_test
 from udccal.fitting.engine.robust import outliers
 from udccal.fitting.noise.codes import converter_step
 from udccal.fitting.noise.flats import Curve
@@ -113,14 +113,16 @@ def notes(
 
 def _gain_by_place(curve: Curve) -> float:
     """Relative scatter of the gain over the sensor; 0 where its parts do not explain most of the misfit."""
-    use, z, dof = curve.levels.usable, np.nan_to_num(curve.fit.variance_z), np.maximum(curve.levels.dof, 1.0)
-    weight = use * dof / 2
-    parts = weight.sum(axis=0) > 0
-    # Of parts that are off by the same fraction at all levels; shot noise is most of the variance of flats.
-    off = (z * np.sqrt(weight)).sum(axis=0)[parts] / weight.sum(axis=0)[parts]
-    explained, levels = float(np.sum(off**2 * weight.sum(axis=0)[parts])), use.sum() / max(parts.sum(), 1)
-    found = f_test(explained / max(curve.fit.misfit.ratio, 1e-9), int(parts.sum()), float(use.sum())).found
-    return float(off.std()) if levels > 2 and found and explained > 0.5 * float(np.sum(z[use] ** 2)) else 0.0
+    use, z = curve.levels.usable, np.nan_to_num(curve.fit.variance_z)
+    scale, part = curve.fit.misfit.ratio, np.broadcast_to(np.arange(use.shape[1]), use.shape)
+    test = group_means_test(z.ravel(), part.ravel(), use.ravel(), scale)
+    groups = use.any(axis=0)
+    explained = test.ratio * scale * np.count_nonzero(groups)
+    if not test.found or explained < 0.5 * float(np.sum(z[use] ** 2)):
+        return 0.0
+    # Shot noise is most of the variance of flats: a part's variances are off by the same fraction at all levels.
+    off = np.where(use, z * np.sqrt(2 / np.maximum(curve.levels.dof, 1.0)), 0.0)
+    return float((off.sum(axis=0)[groups] / use.sum(axis=0)[groups]).std())
 
 
 def _of_darks(data: NoiseMoments, dark: DarkTerms) -> Iterator[str]:

@@ -125,8 +125,8 @@ class DarkTerms:
 
     def shot_DN2(self, K_DN_per_e: float, exposure_s: float) -> float:
         """Variance of dark current's shot noise at this gain."""
-        mean = K_DN_per_e * max(self.dark_DN_per_s.value, 0.0)
-        return (self.own_shot_DN2_per_s.value if self.own_shot_DN2_per_s else mean) * exposure_s
+        own = self.own_shot_DN2_per_s
+        return (own.value if own else K_DN_per_e * self.dark_DN_per_s.value) * exposure_s
 
     @property
     def row_DN2(self) -> Quantity:
