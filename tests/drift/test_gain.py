@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from udccal.drift.changes import gain_change
 from udccal.drift.gain import GainRatio, gain_ratio
 from udccal.drift.limits import DriftLimits
 from udccal.models.noise import Noise
-from udccal.result import Estimate, FitResult
+from udccal.result import Diagnostic, Estimate, FitResult
 from udccal.sessions.store import Average
 
 K, BLACK, READ_E, FRAMES = 0.36, 64.0, 5.0, 10
@@ -22,12 +24,13 @@ def result() -> FitResult[Noise]:
     return fitted("noise", noise, (Estimate("K_DN_per_e", K, 2e-4, "DN/e"),))
 
 
-def averaged(light_e: float | np.ndarray, gain: float, seed: int, flicker: float = 0.0) -> Average:
+def averaged(light_e: float | np.ndarray, gain: float, seed: int, flicker: float = 0.0, cubic: float = 0.0) -> Average:
     """An average of frames, with a pixel that blinks."""
     rng = np.random.default_rng(seed)
     lamp = 1 + flicker * rng.normal(size=(FRAMES, 1, 1))
     electrons = rng.poisson(lamp * light_e, (FRAMES, 200, 300))
-    frames = gain * (electrons + READ_E * rng.normal(size=electrons.shape)) + BLACK
+    frames = gain * (electrons + READ_E * rng.normal(size=electrons.shape))
+    frames += BLACK - cubic * frames**3
     frames[0, 7, 7] += 2000.0
     return Average(frames.mean(axis=0).astype(np.float32), frames.var(axis=0, ddof=1).astype(np.float32), FRAMES)
 
@@ -38,6 +41,18 @@ def test_the_gain_is_found_within_its_error_bar(result: FitResult[Noise], more: 
     assert found.sigma < 0.005
     assert abs(found.value - more) < 4 * found.sigma
     assert found.flicker == 0.0  # light alike in all pixels does not tell
+
+
+def test_the_gain_of_a_response_that_is_no_parabola_is_found(result: FitResult[Noise]) -> None:
+    cubic, span = 5e-9, 4000.0 - BLACK
+    bent = Estimate("nonlinearity", cubic * span**2, 1e-4, "1")
+    estimates = (*result.estimates, bent)
+    parabola = replace(result, estimates=estimates, cov=np.diag([one.sigma**2 for one in estimates]))
+    own = replace(parabola, diagnostics=(Diagnostic("curvature_growth", cubic, "1/DN^2"),))
+    flat, dark = averaged(5000.0, K, 1, cubic=cubic), averaged(0.0, K, 2)
+    found, by_parabola = (gain_ratio(flat, dark, one, "RGGB") for one in (own, parabola))
+    assert abs(found.value - 1) < 4 * found.sigma
+    assert abs(by_parabola.value - 1) > 4 * by_parabola.sigma
 
 
 def mosaic_e() -> np.ndarray:

@@ -8,8 +8,8 @@ from typing import final
 import numpy as np
 
 from udccal.cfa import cfa_named
-from udccal.fitting.noise.response import temporal_variance
-from udccal.models.noise import Noise, linear_signal
+from udccal.fitting.noise.response import linear_mean, temporal_variance
+from udccal.models.noise import Noise
 from udccal.result import FitResult
 from udccal.sessions.store import Average
 from udccal.validation.noise import transfer_numbers
@@ -45,7 +45,7 @@ def gain_ratio(flat: Average, dark: Average, result: FitResult[Noise], cfa: str)
     A lamp that flickers adds variance as the square of the light, the gain's grows as the light: pixels of different
     light tell the two apart. The ratio is that of all variance; flicker is only told.
     """
-    (K, _, _, _, curvature), cov = transfer_numbers(result)
+    (K, _, _, _, curvature), cov, cubic = transfer_numbers(result)
     seen = expected = noise = square = 0.0
     equations, right = np.zeros((2, 2)), np.zeros(2)
     for site in cfa_named(cfa).sites:
@@ -53,8 +53,8 @@ def gain_ratio(flat: Average, dark: Average, result: FitResult[Noise], cfa: str)
         light = (flat.mean[site.samples] - dark.mean[site.samples]).astype(np.float64)
         steady = (lit < _BLINKS * np.median(lit)) & (unlit < _BLINKS * max(float(np.median(unlit)), 1e-9))
         steady &= light > max(_LIT * float(np.median(light)), 0.0)
-        signal = linear_signal(light[steady], curvature, K)
-        own, more = temporal_variance(signal, K, 0.0, curvature, 0.0), lit[steady] - unlit[steady]
+        signal = linear_mean(light[steady], curvature, cubic, K)
+        own, more = temporal_variance(signal, K, 0.0, curvature, 0.0, cubic=cubic), lit[steady] - unlit[steady]
         seen += float(np.sum(more))
         expected += float(np.sum(own))
         square += float(np.sum(light[steady] ** 2))

@@ -107,25 +107,18 @@ class _Transfer:
         """From the profile's fit, and the session's frames by exposure."""
         flats = tuple(sorted(seen.flats, key=lambda one: one.exposure_s))
         mean, variance, samples = (stacked(flats, name) for name in ("mean_DN", "variance_DN2", "samples"))
-        values, cov = transfer_numbers(result)
+        values, cov, cubic = transfer_numbers(result)
         term, rounding = result.term, float(np.asarray(result.term.q_DN)) ** 2 / 12
         # A bin's variance and mean have a common error for light, and independent ones for read noise.
         quiet = values[0] ** 2 * max((values[0] * values[2]) ** 2 - values[3] ** 2, 0.0)
         dof = stacked(flats, "dof")
         dof = dof / (1 + 0.5 * dof * quiet / samples / np.maximum(variance, 1e-9) ** 2)
-        span = float(np.asarray(term.saturation_DN)) - float(np.asarray(term.black_DN))
-        # The term's parabola meets such a response at full scale.
-        cubic = float(
-            np.clip(result.diagnostic("curvature_growth") or 0.0, -_MOST_CUBIC / span**2, _MOST_CUBIC / span**2)
-        )
-        values[4] -= cubic * span
         return cls(mean, variance, dof, _inside(flats, term), rounding, values, cov, cubic)
 
     def predicted(self, values: Float[np.ndarray, "5"]) -> Float[np.ndarray, " n"]:
         """Variance of the usable bins in DN^2."""
         K, black, sigma_d, row, curvature = values
-        above = self.mean[self.usable] - black
-        signal = linear_mean(above, *(np.full_like(above, one) for one in (curvature, self.cubic, K)))
+        signal = linear_mean(self.mean[self.usable] - black, curvature, self.cubic, K)
         floor = (K * sigma_d) ** 2 - row**2
         return np.asarray(temporal_variance(signal, K, floor, curvature, self.rounding, cubic=self.cubic))
 
@@ -168,8 +161,10 @@ class _Transfer:
         return ratio, float(np.hypot(information**-0.5, self.cov[0, 0] ** 0.5 / self.values[0]))
 
 
-def transfer_numbers(result: FitResult[Noise]) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "5 5"]]:
-    """Return the numbers of photon transfer and their covariance.
+def transfer_numbers(
+    result: FitResult[Noise],
+) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "5 5"], float]:
+    """Return the numbers of photon transfer and their covariance, and the response's cubic part [1/DN^2].
 
     They are K [DN/e], black level [DN], dark noise [e], row noise [DN] and curvature [1/DN]. The curvature of a
     straight response is 0 and certain.
@@ -177,12 +172,15 @@ def transfer_numbers(result: FitResult[Noise]) -> tuple[Float[np.ndarray, "5"], 
     term, names = result.term, [one.name for one in result.estimates[: len(result.cov)]]
     span = float(np.asarray(term.saturation_DN)) - float(np.asarray(term.black_DN))
     bent = result.estimate("nonlinearity").value if "nonlinearity" in names else 0.0
-    values = np.array([*(float(np.asarray(getattr(term, name))) for name in _NAMES[:-1]), bent / span])
+    # A response that is no parabola has the term's at full scale only.
+    cubic = float(np.clip(result.diagnostic("curvature_growth") or 0.0, *(np.array([-1, 1]) * _MOST_CUBIC / span**2)))
+    curvature = bent / span - cubic * span
+    values = np.array([*(float(np.asarray(getattr(term, name))) for name in _NAMES[:-1]), curvature])
     cov, known = np.zeros((5, 5)), [name for name in _NAMES if name in names]
     to, at = [_NAMES.index(name) for name in known], [names.index(name) for name in known]
     cov[np.ix_(to, to)] = result.cov[np.ix_(at, at)]
     unit = np.array([1.0, 1.0, 1.0, 1.0, 1 / span])
-    return values, cov * np.outer(unit, unit)
+    return values, cov * np.outer(unit, unit), cubic
 
 
 def _inside(flats: tuple[Moments, ...], term: Noise) -> Bool[np.ndarray, "flats bins"]:

@@ -27,7 +27,7 @@ def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_
     return light * steepness(signal_DN, curvature_per_DN, cubic) ** 2 + V0_DN2 + rounding_DN2
 
 
-def linear_mean(mean_DN: Means, curvature: Means, cubic: Means, K_DN_per_e: Means) -> Means:
+def linear_mean(mean_DN: Means, curvature: Means | float, cubic: Means | float, K_DN_per_e: Means | float) -> Means:
     """The linear signal of means of many frames: the inverse of z - c (z^2 + K z) - d (z^3 + 3 K z^2 + K^2 z).
 
     K z is the variance of shot noise, and K^2 z its third moment.
